@@ -1,0 +1,1 @@
+"""What both rooms, `pipeline` and `dope`, stand on: errors, settings, seeds and safe files. No heavy imports."""

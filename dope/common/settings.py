@@ -1,0 +1,142 @@
+"""Settings: frozen dataclasses read from YAML and `--set key=value`, strict about names and types.
+
+A config class lives beside the code it configures; each field has one docstring line (the string literal below
+it). Unknown keys are errors that name the closest known key. `config_hash` identifies a resolved config.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import hashlib
+import json
+import types
+import typing
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+
+from dope.common.errors import UsageError
+
+Config = TypeVar("Config")
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """A config as plain nested dicts, in the order of its fields."""
+    return dataclasses.asdict(config)
+
+
+def config_hash(config: Any) -> str:
+    """16 hex digits that change whenever any setting does."""
+    value = to_dict(config) if dataclasses.is_dataclass(config) else config
+    return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+
+def from_mapping(cls: type[Config], values: Mapping[str, Any], *, where: str = "configuration") -> Config:
+    """Build `cls` from nested mappings; what is absent keeps its default.
+
+    Raises:
+        UsageError: an unknown key (the closest known one is named) or a value of the wrong type.
+    """
+    hints = typing.get_type_hints(cls)
+    known = {field.name for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    arguments: dict[str, Any] = {}
+    for key, value in values.items():
+        if key not in known:
+            raise UsageError(_unknown(str(key), known), where=where)
+        arguments[key] = _convert(hints[key], value, f"{where}: {key}")
+    return cls(**arguments)
+
+
+def override(config: Config, assignments: Iterable[str]) -> Config:
+    """Apply `section.key=value` strings (values are YAML) to a config.
+
+    Raises:
+        UsageError: no "=", an unknown key or a value of the wrong type.
+    """
+    for assignment in assignments:
+        path, equals, text = assignment.partition("=")
+        if not equals:
+            raise UsageError(f"'{assignment}' is not key=value", where="--set")
+        config = _replace(config, path.strip().split("."), yaml.safe_load(text), f"--set {path.strip()}")
+    return config
+
+
+def load_yaml(path: Path) -> dict[str, Any]:
+    """Read a YAML mapping. Raises `UsageError` where it is absent, malformed or not a mapping."""
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(f"cannot be read ({error.strerror})", where=path) from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise UsageError(f"is not valid YAML ({error})", where=path) from error
+    if values is None:
+        return {}
+    if not isinstance(values, dict):
+        raise UsageError("must be a mapping of settings", where=path)
+    return values
+
+
+def _unknown(key: str, known: Iterable[str]) -> str:
+    close = difflib.get_close_matches(key, list(known), n=1)
+    hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(sorted(known))}"
+    return f"unknown key '{key}' ({hint})"
+
+
+def _replace(config: Any, path: list[str], value: Any, where: str) -> Any:
+    known = {field.name for field in dataclasses.fields(config)}
+    if path[0] not in known:
+        raise UsageError(_unknown(path[0], known), where=where)
+    if len(path) == 1:
+        hint = typing.get_type_hints(type(config))[path[0]]
+        return dataclasses.replace(config, **{path[0]: _convert(hint, value, where)})
+    inner = getattr(config, path[0])
+    if not dataclasses.is_dataclass(inner):
+        raise UsageError(f"'{path[0]}' has no settings below it", where=where)
+    return dataclasses.replace(config, **{path[0]: _replace(inner, path[1:], value, where)})
+
+
+def _convert(hint: Any, value: Any, where: str) -> Any:
+    origin = typing.get_origin(hint)
+    if origin in (typing.Union, types.UnionType):
+        return _convert_union(hint, value, where)
+    if origin is typing.Literal:
+        if value not in typing.get_args(hint):
+            choices = ", ".join(map(str, typing.get_args(hint)))
+            raise UsageError(f"'{value}' is not one of {choices}", where=where)
+        return value
+    if dataclasses.is_dataclass(hint) and isinstance(value, Mapping):
+        return from_mapping(typing.cast(type, hint), value, where=where)
+    if origin is tuple and isinstance(value, (list, tuple)):
+        kinds = typing.get_args(hint)
+        if kinds[-1:] == (Ellipsis,):
+            kinds = kinds[:1] * len(value)
+        if len(kinds) == len(value):
+            return tuple(_convert(kind, item, where) for kind, item in zip(kinds, value, strict=True))
+    if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+        return float(value)
+    if hint is float and isinstance(value, str):  # YAML 1.1 reads 1e-4 as a string
+        try:
+            return float(value)
+        except ValueError:
+            pass
+    if hint is Any or (isinstance(hint, type) and type(value) is hint):
+        return value
+    name = getattr(hint, "__name__", None) if origin is None else str(hint)
+    raise UsageError(f"'{value}' is not of type {name or hint}", where=where)
+
+
+def _convert_union(hint: Any, value: Any, where: str) -> Any:
+    choices = typing.get_args(hint)
+    if value is None and type(None) in choices:
+        return None
+    for choice in choices:
+        if choice is type(None):
+            continue
+        try:
+            return _convert(choice, value, where)
+        except UsageError:
+            continue
+    raise UsageError(f"'{value}' is not of type {hint}", where=where)
