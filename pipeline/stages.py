@@ -21,6 +21,15 @@ from dope.common import files, settings
 from dope.common.errors import BadInput, DiskFull, DopeError
 from pipeline.sequence import Sequence
 
+LATER_STAGES = {
+    "frames": ("sfm", "depth", "masks", "correspond"),
+    "sfm": ("depth", "masks", "correspond"),
+    "depth": ("correspond",),
+    "masks": ("correspond",),
+    "correspond": (),
+}
+"""What must be done again after a stage was run: their markers are removed before it starts."""
+
 Status = Literal["ok", "empty", "failed"]
 
 
@@ -109,7 +118,8 @@ def run_stage(
     if done and done.fingerprint == mark and not overwrite and not (retry_failed and done.status == "failed"):
         done.skipped = True
         return done
-    marker_path(sequence, stage).unlink(missing_ok=True)
+    for name in (*reversed(LATER_STAGES[stage]), stage):
+        marker_path(sequence, name).unlink(missing_ok=True)
     start, cpu = time.perf_counter(), cpu_seconds()
     result = StageResult(sequence.id, stage, "ok", fingerprint=mark, versions={"dope": dope.__version__})
     try:
@@ -126,10 +136,15 @@ def run_stage(
     result.seconds = round(time.perf_counter() - start, 3)
     result.cpu_seconds = round(cpu_seconds() - cpu, 3)
     result.peak_memory_mib = round(peak_memory_mib(), 1)
+    write_marker(sequence, result)
+    return result
+
+
+def write_marker(sequence: Sequence, result: StageResult) -> None:
+    """Write a stage's done-marker: the last thing that a stage does."""
     values = asdict(result)
     values.pop("skipped")
-    files.write_json(marker_path(sequence, stage), values)
-    return result
+    files.write_json(marker_path(sequence, result.stage), values)
 
 
 def cpu_seconds() -> float:

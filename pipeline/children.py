@@ -1,0 +1,185 @@
+"""Run native work in a child process with limits on time and memory, so that a crash costs one sequence only.
+
+COLMAP's C++ code can abort, OpenCV's decoders can crash on damaged files, and either can eat all memory: the parent
+survives, and says what happened with the last lines that the child printed.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import resource
+import signal
+import sys
+import tempfile
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from dope.common.errors import BadInput, DopeError
+
+Notify = Callable[[str], None]
+"""Called by the work with a few words on what it does now."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What one sequence may use."""
+
+    minutes: float = 60.0
+    """Wall-clock limit of one sequence."""
+    memory_gib: float = 8.0
+    """Limit of the child's private memory."""
+    threads: int = 1
+    """Native threads of one sequence. 1 makes reconstructions repeat to the bit; parallelism is over sequences."""
+
+
+class ChildFailed(BadInput):
+    """The child died or ran out of its limits."""
+
+
+_stopping = threading.Event()
+
+
+def stop_children() -> None:
+    """End all running children: their callers get `ChildFailed`. For Ctrl-C; there is no way back."""
+    _stopping.set()
+
+
+def run_in_child(work: Callable[..., Any], *args: Any, limits: Limits, notify: Notify | None = None) -> Any:
+    """Call `work(*args, notify)` in a fresh process and return its result.
+
+    Args:
+        work: a function importable by name; its last argument is `notify(text)`.
+        limits: wall-clock minutes, memory and threads.
+        notify: called in this process with what the child reports.
+
+    Raises:
+        ChildFailed: the child was killed, crashed, ran out of time or memory; the message says which.
+        Exception: whatever `work` raised.
+    """
+    context = multiprocessing.get_context("spawn")
+    receiver, sender = context.Pipe(duplex=False)
+    with tempfile.NamedTemporaryFile(prefix="dope-child-", suffix=".log") as log:
+        child = context.Process(target=_child_main, args=(sender, log.name, limits, work, args), daemon=False)
+        with _single_threaded_environment(limits.threads):
+            child.start()
+        sender.close()
+        try:
+            return _listen(receiver, child, limits, notify, Path(log.name))
+        finally:
+            if child.is_alive():
+                child.kill()
+            child.join()
+            receiver.close()
+
+
+def _listen(receiver: Connection, child: Any, limits: Limits, notify: Notify | None, log: Path) -> Any:
+    deadline = time.monotonic() + limits.minutes * 60
+    while True:
+        if not receiver.poll(max(0.0, min(0.5, deadline - time.monotonic()))):
+            if _stopping.is_set():
+                raise ChildFailed("was stopped before it was done", remedy="Run the same command again to go on")
+            if time.monotonic() < deadline:
+                continue
+            raise ChildFailed(
+                f"took longer than {limits.minutes:g} minutes and was stopped",
+                remedy="Raise --minutes, or use fewer or smaller frames (--count, --long-side)",
+            )
+        try:
+            kind, value = receiver.recv()
+        except EOFError:
+            child.join()
+            raise ChildFailed(_cause_of_death(child.exitcode, limits, log)) from None
+        if kind == "note":
+            if notify:
+                notify(value)
+        elif kind == "error":
+            raise value
+        else:
+            return value
+
+
+def _cause_of_death(exitcode: int | None, limits: Limits, log: Path) -> str:
+    tail = " | ".join(log.read_text(errors="replace").strip().splitlines()[-3:])
+    said = f"; it last said: {tail[-400:]}" if tail else ""
+    if exitcode is not None and exitcode < 0:
+        name = signal.Signals(-exitcode).name
+        if name == "SIGKILL":
+            said += f" (often a lack of memory; its own limit is {limits.memory_gib:g} GiB, --memory-gib)"
+        return f"the process was ended by {name}{said}"
+    return f"the process ended with exit code {exitcode}{said}"
+
+
+class _single_threaded_environment:
+    """Set the thread counts that native libraries read at import, for the child's start only."""
+
+    def __init__(self, threads: int) -> None:
+        names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+        self.values = {name: str(threads) for name in names}
+
+    def __enter__(self) -> None:
+        self.before = {name: os.environ.get(name) for name in self.values}
+        os.environ.update(self.values)
+
+    def __exit__(self, *_: object) -> None:
+        for name, value in self.before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def _child_main(sender: Connection, log: str, limits: Limits, work: Callable[..., Any], args: tuple[Any, ...]) -> None:
+    file = os.open(log, os.O_WRONLY | os.O_APPEND)
+    for stream in (1, 2):  # native code writes here; the parent's terminal belongs to the progress display
+        os.dup2(file, stream)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    _die_with_parent()
+    limit = int(limits.memory_gib * 2**30)
+    resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
+    try:
+        import cv2
+
+        cv2.setNumThreads(limits.threads)
+        result: tuple[str, Any] = ("result", work(*args, lambda text: sender.send(("note", text))))
+    except MemoryError:
+        result = ("error", _out_of_memory(limits))
+    except BaseException as error:
+        result = ("error", _portable(error, limits))
+    sender.send(result)
+    sender.close()
+    sys.stdout.flush()
+    os._exit(0)  # native libraries' exit handlers have crashed after good work
+
+
+def _die_with_parent() -> None:
+    """Linux: be killed when the parent is, so that no orphan goes on writing."""
+    if sys.platform == "linux":
+        import ctypes
+
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+
+
+def _out_of_memory(limits: Limits) -> ChildFailed:
+    return ChildFailed(
+        f"needed more than {limits.memory_gib:g} GiB of memory",
+        remedy="Raise --memory-gib, or use fewer or smaller frames (--count, --long-side)",
+    )
+
+
+def _portable(error: BaseException, limits: Limits) -> BaseException:
+    """The error itself if it can be sent, else its text; lack of memory by any name becomes one message."""
+    if not isinstance(error, DopeError) and ("bad_alloc" in str(error) or "OutOfMemory" in str(error)):
+        return _out_of_memory(limits)
+    try:
+        pickle.loads(pickle.dumps(error))
+        return error
+    except Exception:  # an exception class with its own constructor: its text must do
+        return RuntimeError("".join(traceback.format_exception_only(error)).strip())

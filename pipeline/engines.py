@@ -1,0 +1,144 @@
+"""Run one stage over many items: this machine's processes, and a container's share of an array job.
+
+Every engine has one signature: items in, one result each out, in the order of the items.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from dope.common.errors import BadInput, UsageError
+from pipeline.children import stop_children
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class Share:
+    """Part `index` of `count` equal parts of a list of items: N containers share one WORK."""
+
+    index: int = 0
+    count: int = 1
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.index < self.count:
+            raise UsageError(
+                f"shard index {self.index} is not in 0..{self.count - 1}", remedy="Check --shard-index and --num-shards"
+            )
+
+    def of(self, items: Sequence[Item]) -> list[Item]:
+        """Every `count`-th item from `index` on; over all indices each item once."""
+        return list(items[self.index :: self.count])
+
+
+def find_share(index: int | None, count: int | None, environment: Mapping[str, str] | None = None) -> Share:
+    """The share from the flags, else from the array variables of Slurm, AWS Batch or Kubernetes, else everything.
+
+    Slurm gives SLURM_ARRAY_TASK_ID, _MIN, _STEP and _COUNT; AWS Batch AWS_BATCH_JOB_ARRAY_INDEX and _SIZE; Kubernetes
+    indexed jobs JOB_COMPLETION_INDEX, and JOB_COMPLETIONS where the manifest passes it on.
+
+    Raises:
+        UsageError: an index without a count, or one that is not a number or out of range.
+    """
+    env = os.environ if environment is None else environment
+    if index is not None or count is not None:
+        if index is None or count is None:
+            raise UsageError("--shard-index and --num-shards go together")
+        return Share(index, count)
+    if "SLURM_ARRAY_TASK_ID" in env:
+        start, step = int(env.get("SLURM_ARRAY_TASK_MIN", "0")), int(env.get("SLURM_ARRAY_TASK_STEP", "1"))
+        index = (_number(env, "SLURM_ARRAY_TASK_ID") - start) // max(step, 1)
+        return Share(index, _count(env, "SLURM_ARRAY_TASK_COUNT"))
+    if "AWS_BATCH_JOB_ARRAY_INDEX" in env:
+        return Share(_number(env, "AWS_BATCH_JOB_ARRAY_INDEX"), _count(env, "AWS_BATCH_JOB_ARRAY_SIZE"))
+    if "JOB_COMPLETION_INDEX" in env:
+        return Share(_number(env, "JOB_COMPLETION_INDEX"), _count(env, "JOB_COMPLETIONS"))
+    return Share()
+
+
+def _number(env: Mapping[str, str], name: str) -> int:
+    try:
+        return int(env[name])
+    except ValueError:
+        raise UsageError(f"'{env[name]}' is not a number", where=name) from None
+
+
+def _count(env: Mapping[str, str], name: str) -> int:
+    if name not in env:
+        raise UsageError(
+            f"this is one task of an array, but {name} does not say of how many",
+            remedy="Pass --shard-index and --num-shards",
+        )
+    return _number(env, name)
+
+
+def run_items(
+    items: Sequence[Item], work: Callable[[Item], Result], *, workers: int, done: Callable[[Result], None] | None = None
+) -> list[Result]:
+    """Call `work` on every item, `workers` at a time, each in a thread that waits for a child process.
+
+    `work` turns failures of an item into its result; what it raises (a full disk, Ctrl-C) stops the whole run: no new
+    item is started, and the error is raised when the running ones have ended.
+
+    Args:
+        done: called with each result as it comes, in this thread's stead; must be thread-safe.
+    """
+
+    def one(item: Item) -> Result:
+        result = work(item)
+        if done:
+            done(result)
+        return result
+
+    if workers <= 1 or len(items) <= 1:
+        return [one(item) for item in items]
+    with ThreadPoolExecutor(max_workers=workers) as pool:
+        futures = [pool.submit(one, item) for item in items]
+        try:
+            wait(futures, return_when=FIRST_EXCEPTION)
+        except KeyboardInterrupt:
+            stop_children()
+            raise
+        finally:
+            for future in futures:
+                future.cancel()
+    for future in futures:  # the cause first: cancelled futures would hide it
+        if not future.cancelled() and (error := future.exception()):
+            raise error
+    return [future.result() for future in futures]
+
+
+@contextmanager
+def holding(folder: Path) -> Iterator[None]:
+    """Hold a sequence's folder for this process; a second run is told who holds it.
+
+    Raises:
+        BadInput: another process works on the folder.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / ".lock").open("a+") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            lock.seek(0)
+            holder = lock.read().strip() or "another process"
+            raise BadInput(
+                f"is being worked on by {holder}", where=folder, remedy="Wait for it, or stop it, then run again"
+            ) from None
+        lock.truncate(0)
+        lock.write(f"process {os.getpid()} on {os.uname().nodename}")
+        lock.flush()
+        yield
+
+
+def default_workers() -> int:
+    """The CPUs this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
