@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -76,9 +75,19 @@ class Camera:
             return np.zeros((0, 2))
         if not self.is_distorted:
             return (pixels - self.K[:2, 2]) / self.K[[0, 1], [0, 1]]
-        points = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
-        criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 20, 1e-9)
-        return cv2.undistortPointsIter(points, self.K, self.distortion, None, None, criteria).reshape(-1, 2)
+        k1, k2, p1, p2 = self.distortion
+        target = (np.asarray(pixels, dtype=np.float64) - self.K[:2, 2]) / self.K[[0, 1], [0, 1]]
+        x, y = target.T
+        for _ in range(50):  # the fixed point of the distortion model; OpenCV 4 and 5 name their solver differently
+            r2 = x * x + y * y
+            radial = 1 + r2 * (k1 + r2 * k2)
+            next_x = (target[:, 0] - 2 * p1 * x * y - p2 * (r2 + 2 * x * x)) / radial
+            next_y = (target[:, 1] - p1 * (r2 + 2 * y * y) - 2 * p2 * x * y) / radial
+            change = max(np.abs(next_x - x).max(), np.abs(next_y - y).max())
+            x, y = next_x, next_y
+            if change < 1e-10:
+                break
+        return np.stack([x, y], axis=1)
 
     def unproject(self, pixels: Floats, depth: Floats) -> Floats:
         """Pixels (N, 2) with z-depths (N,) to world points (N, 3)."""
