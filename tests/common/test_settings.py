@@ -1,0 +1,74 @@
+"""Settings are strict: what is misspelt or of the wrong type is an error that helps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import pytest
+
+from dope.common.errors import UsageError
+from dope.common.settings import config_hash, from_mapping, load_yaml, override
+
+
+@dataclass(frozen=True)
+class Inner:
+    learning_rate: float = 0.1
+    sizes: tuple[int, ...] = (1, 2)
+    mode: Literal["a", "b"] = "a"
+
+
+@dataclass(frozen=True)
+class Outer:
+    inner: Inner = field(default_factory=Inner)
+    count: int | None = None
+    name: str = "x"
+
+
+def test_values_reach_their_fields_and_the_rest_keeps_its_default() -> None:
+    config = from_mapping(Outer, {"inner": {"learning_rate": 1, "sizes": [4, 5, 6]}, "count": 3})
+    assert config == Outer(Inner(1.0, (4, 5, 6), "a"), 3, "x")
+    assert isinstance(config.inner.learning_rate, float)
+
+
+def test_override_reads_yaml_values() -> None:
+    config = override(Outer(), ["inner.learning_rate=1e-4", "inner.mode=b", "count=null", "inner.sizes=[7]"])
+    assert config.inner == Inner(1e-4, (7,), "b")
+
+
+@pytest.mark.parametrize(
+    ("assignment", "message"),
+    [
+        ("inner.learning_rat=1", "did you mean 'learning_rate'"),
+        ("iner.learning_rate=1", "did you mean 'inner'"),
+        ("name.x=1", "no settings below"),
+        ("inner.mode=c", "not one of a, b"),
+        ("count=many", "not of type"),
+        ("count=true", "not of type"),
+        ("inner.sizes=[1, x]", "not of type"),
+        ("count", "not key=value"),
+    ],
+)
+def test_wrong_assignments_are_named(assignment: str, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        override(Outer(), [assignment])
+
+
+def test_unknown_key_in_a_file_names_the_file_and_the_closest_key(tmp_path) -> None:
+    path = tmp_path / "train.yaml"
+    path.write_text("inner:\n  learning_rates: 0.2\n")
+    with pytest.raises(UsageError, match=r"train\.yaml: inner: unknown key 'learning_rates' \(did you mean"):
+        from_mapping(Outer, load_yaml(path), where=str(path))
+
+
+@pytest.mark.parametrize("text", ["- a\n- b\n", "a: [1", "\x00"])
+def test_files_that_are_not_mappings_are_refused(tmp_path, text: str) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+    with pytest.raises(UsageError, match=r"bad\.yaml"):
+        load_yaml(path)
+
+
+def test_hash_changes_with_any_setting_and_only_then() -> None:
+    assert config_hash(Outer()) == config_hash(Outer())
+    assert config_hash(Outer()) != config_hash(override(Outer(), ["inner.mode=b"]))
