@@ -78,7 +78,7 @@ def test_epipolar_distance_is_zero_on_matches_and_counts_pixels_off_them() -> No
 def test_angles() -> None:
     assert rotation_angle_deg(rotation(0, 0, np.radians(1e-5))) == pytest.approx(1e-5, rel=1e-6)
     assert rotation_angle_deg(rotation(0, np.pi, 0)) == pytest.approx(180)
-    R, t = relative_pose(camera(), camera(angle=0.4))
+    R, _ = relative_pose(camera(), camera(angle=0.4))
     np.testing.assert_allclose(R @ camera().R, camera(angle=0.4).R, atol=1e-12)
     first = Camera(1, 1, np.eye(3), np.zeros(4), np.eye(3), np.array([0, 0, 1.0]))  # centre (0, 0, -1)
     second = Camera(1, 1, np.eye(3), np.zeros(4), np.eye(3), np.array([1.0, 0, 0]))  # centre (-1, 0, 0)
