@@ -1,0 +1,49 @@
+"""Farthest point sampling of many point sets at once, on whatever device they lie."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+TAKEN = -1.0  # a squared distance below any real one: such a point is never the farthest
+
+
+@torch.no_grad()
+def farthest_points(
+    points: Tensor, valid: Tensor, n: int, generator: torch.Generator | None = None
+) -> tuple[Tensor, Tensor]:
+    """Choose `n` points of each set, each the farthest from those chosen before, from a random start.
+
+    No point is chosen twice, and no invalid point ever. Ties go to the lowest index.
+
+    Args:
+        points: (B, N, 2) float.
+        valid: (B, N) bool, False for padding.
+        n: points to choose of each set.
+        generator: of the random starts; PyTorch's default one where None.
+
+    Returns:
+        (B, n) long indices and (B, n) bool: False beyond the number of valid points, where the index repeats the first
+        choice (0 where a set has no valid point).
+    """
+    count = valid.sum(1)
+    ok = torch.arange(n, device=points.device) < count[:, None]
+    index = torch.zeros(len(points), n, dtype=torch.long, device=points.device)
+    if points.shape[1] == 0 or n == 0:
+        return index, ok
+    # padding may hold anything, NaN included; x and y apart keep every pass contiguous
+    x, y = points.float().masked_fill(~valid[..., None], 0.0).unbind(-1)
+    x, y = x.contiguous(), y.contiguous()
+    distance = torch.where(valid, torch.inf, TAKEN)
+    device = points.device if generator is None else generator.device
+    draw = torch.rand(len(points), generator=generator, device=device).to(points.device)
+    start = (draw * count).long().clamp(max=points.shape[1] - 1)  # the start-th valid point
+    chosen = ((valid.cumsum(1) == start[:, None] + 1) & valid).to(torch.uint8).argmax(1, keepdim=True)
+    for i in range(n):
+        if i > 0:
+            chosen = distance.argmax(1, keepdim=True)
+        index[:, i : i + 1] = chosen
+        dx, dy = x - x.gather(1, chosen), y - y.gather(1, chosen)
+        distance = torch.minimum(distance, dx.mul_(dx).add_(dy.mul_(dy)), out=distance)
+        distance.scatter_(1, chosen, TAKEN)
+    return torch.where(ok, index, index[:, :1]), ok
