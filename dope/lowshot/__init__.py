@@ -1,0 +1,1 @@
+"""Low-shot recognition with dense descriptors: episodes, local matching, the protocol and its result rows."""
