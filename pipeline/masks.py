@@ -1,0 +1,163 @@
+"""Masks made by other tools brought into a prepared sequence: matched by name, checked, thresholded, resized.
+
+What counts as object in a mask file, whatever its bit depth:
+
+- one channel: the value; an alpha channel that is not the same everywhere: alpha; else the largest of the colours;
+- object = value above `threshold` times the largest value the file's type can hold (255, 65535);
+- label images, whose values are 0, 1, 2 ...: where no value in any of the masks reaches that, object = not zero.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dope.common import files
+from dope.common.errors import BadInput
+from pipeline.photos import decode, list_photos, read_jpeg_header, turn_upright
+from pipeline.sequence import Frame, Sequence, write_image
+
+LISTED = 10
+"""Names listed in the details before only the count is given."""
+
+
+@dataclass(frozen=True)
+class MasksConfig:
+    """Where masks come from and what counts as one."""
+
+    source: Literal["folder", "grabcut"] = "folder"
+    """Import masks of other tools ("folder") or cut the object out, guided by the sparse points ("grabcut")."""
+    threshold: float = 0.5
+    """Object is above this share of the largest value that the mask's type can hold."""
+    min_share: float = 0.0005
+    """A mask with a smaller share of object pixels is empty."""
+
+
+def import_masks(sequence: Sequence, folder: Path, config: MasksConfig) -> dict[str, Any]:
+    """Write masks/ for the frames that have an image and note them in frames.parquet.
+
+    A mask belongs to a photo `IMG_1.jpg` as `IMG_1.png` or `IMG_1.jpg.png`, to a video's frame by the last number in
+    its name, the frame's number from 0 (`000123.png`, `frame_000123.png`). It has the size of the source image
+    or of the stored one, and is upright, or lies as the photo's pixels do before its EXIF orientation is applied.
+
+    Returns:
+        {"masks", "missing", "empty", "mean_share"}, with "missing_frames" and "empty_frames" (names) where there are
+        any. A frame without a mask has none in frames.parquet; an empty mask is written as it is.
+
+    Raises:
+        BadInput: no such folder, a mask that cannot be read or has another size, no mask matches, all are empty.
+    """
+    if not folder.is_dir():
+        raise BadInput("no such folder of masks", where=folder)
+    frames = sequence.read_frames()
+    shown = [frame for frame in frames if frame.image is not None]
+    info = sequence.read_info()
+    by_number = info.kind == "video"
+    found = _match(shown, folder, by_number=by_number)
+    if not found:
+        names = ", ".join(frame.source_name for frame in shown[:3])
+        how = "the frame's number from 0, e.g. 000012.png" if by_number else "the photo's name, e.g. IMG_1.png"
+        raise BadInput(f"no mask belongs to any frame ({names} ...)", where=folder, remedy=f"A mask's name is {how}")
+    cutoff = config.threshold if _any_above(found.values(), config.threshold) else 0.0
+    shares: list[float] = []
+    empty: list[str] = []
+    with files.atomic_folder(sequence.masks) as partial:
+        for frame in frames:
+            path = found.get(frame.frame)
+            frame.mask = None
+            if path is None:
+                continue
+            mask = _fitted(read_mask_values(path) > cutoff, frame, path, Path(info.source))
+            frame.mask = f"masks/{frame.frame:06d}.png"
+            write_image(partial / f"{frame.frame:06d}.png", mask.astype(np.uint8) * 255)
+            shares.append(float(mask.mean()))
+            if shares[-1] < config.min_share:
+                empty.append(frame.source_name)
+        if len(empty) == len(shares):
+            raise BadInput("all masks are empty", where=folder, remedy="Object pixels are bright, the others black")
+    sequence.write_frames(frames)
+    missing = [frame.source_name for frame in shown if frame.mask is None]
+    return mask_details(shares, missing, empty)
+
+
+def mask_details(shares: list[float], missing: list[str], empty: list[str]) -> dict[str, Any]:
+    """The details that both ways to masks report. `shares`: object's share of each mask written."""
+    share = round(float(np.mean(shares)), 4) if shares else 0.0
+    details: dict[str, Any] = {"masks": len(shares), "missing": len(missing), "empty": len(empty), "mean_share": share}
+    for key, names in (("missing_frames", missing), ("empty_frames", empty)):
+        if names:
+            more = [f"... {len(names) - LISTED} more"] if len(names) > LISTED else []
+            details[key] = names[:LISTED] + more
+    return details
+
+
+def read_mask_values(path: Path) -> NDArray[np.float32]:
+    """A mask file's values (height, width) in [0, 1]. Raises `BadInput` where it cannot be decoded."""
+    try:
+        image = decode(path.read_bytes(), cv2.IMREAD_UNCHANGED)
+    except OSError as error:
+        raise BadInput(f"cannot be read ({error.strerror})", where=path) from error
+    except BadInput as error:
+        raise BadInput(error.what, where=path) from error
+    largest = np.iinfo(image.dtype).max if np.issubdtype(image.dtype, np.integer) else 1.0
+    if image.ndim == 3:
+        alpha = image[..., -1] if image.shape[2] in (2, 4) else None
+        informative = alpha is not None and alpha.min() != alpha.max()
+        colours = image[..., :-1] if alpha is not None else image
+        image = alpha if alpha is not None and informative else colours.max(axis=2)
+    return (image / np.float32(largest)).astype(np.float32)
+
+
+def _match(frames: list[Frame], folder: Path, *, by_number: bool) -> dict[int, Path]:
+    """Mask files of frames, by frame index."""
+    named: dict[str, Path] = {}
+    for path in list_photos(folder):
+        # what COLMAP expects (a.jpg.png) and what most tools write (a.png); PNG wins over the lossy kinds
+        if path.stem not in named or path.suffix.lower() == ".png":
+            named[path.stem] = path
+    if not by_number:
+        pairs = ((frame, named.get(frame.source_name, named.get(Path(frame.source_name).stem))) for frame in frames)
+        return {frame.frame: path for frame, path in pairs if path is not None}
+    numbered = {int(digits[-1]): path for stem, path in named.items() if (digits := re.findall(r"\d+", stem))}
+    return {f.frame: numbered[int(f.source_name)] for f in frames if int(f.source_name) in numbered}
+
+
+def _any_above(paths: Any, threshold: float) -> bool:
+    """Does any mask reach the threshold? The first nearly always does, so this seldom reads a second."""
+    return any(float(values.max(initial=0)) > threshold for values in _values(paths))
+
+
+def _values(paths: Any) -> Iterator[NDArray[np.float32]]:
+    for path in paths:
+        yield read_mask_values(path)
+
+
+def _fitted(mask: NDArray[np.bool_], frame: Frame, path: Path, photos: Path) -> NDArray[np.bool_]:
+    """The mask at the size of the stored image."""
+    stored, source = (frame.width, frame.height), (frame.source_width, frame.source_height)
+    size = (mask.shape[1], mask.shape[0])
+    if size not in (stored, source) and size[::-1] in (stored, source):
+        mask = _upright(mask, photos / frame.source_name)
+    if (mask.shape[1], mask.shape[0]) == stored:
+        return mask
+    if (mask.shape[1], mask.shape[0]) != source:
+        raise BadInput(
+            f"the mask is {size[0]}x{size[1]}, its image '{frame.source_name}' is {source[0]}x{source[1]}",
+            where=path,
+            remedy="A mask has the size of its image",
+        )
+    small = cv2.resize(mask.astype(np.float32), stored, interpolation=cv2.INTER_AREA)
+    return np.asarray(small >= 0.5)
+
+
+def _upright(mask: NDArray[np.bool_], photo: Path) -> NDArray[np.bool_]:
+    """Turn a mask that was drawn on a photo's pixels as they lie in the file (annotation tools ignore EXIF)."""
+    header = read_jpeg_header(photo.read_bytes()) if photo.is_file() else None
+    return mask if header is None else turn_upright(mask, header.orientation)

@@ -1,0 +1,224 @@
+"""Which sequences a command line means: video files, folders of photos, and folders of either, an id for each.
+
+car.mp4                     one sequence
+fox/0001.jpg ...            one sequence (a folder of photos)
+fox/images/ + fox/masks/    one sequence named `fox`: a folder that holds `images` with photos is one capture
+videos/*.mov                one sequence a video
+<category>/<instance>.mp4   any depth of folders above videos and captures
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from dope.common import files
+from dope.common.errors import BadInput
+from pipeline.photos import PHOTO_SUFFIXES, UNSUPPORTED_PHOTOS, list_photos, natural_order
+from pipeline.sequence import sequence_id
+
+VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"})
+NOT_PHOTOS = frozenset({"mask", "masks", "depth", "depths", "segmentation", "segmentations"})
+"""Folder names that lie beside photos and videos and are never taken for a capture unless they are named."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """One raw input: a video file, or a folder of photos.
+
+    Attributes:
+        path: the video, or the folder that holds the photos themselves.
+        id: name of the sequence, unique among the sources of one command.
+        kind: "video" or "photos".
+        category: the class label, or None; carried for evaluation only.
+        instance: name of the object.
+        masks: folder of masks made by other tools, or None.
+    """
+
+    path: Path
+    id: str
+    kind: Literal["video", "photos"]
+    category: str | None = None
+    instance: str | None = None
+    masks: Path | None = None
+
+    @property
+    def home(self) -> Path:
+        """What the sequence is named after: the video, or the capture's folder (not its `images`)."""
+        inner = self.kind == "photos" and self.path.name == "images"
+        return self.path.parent if inner and self.path.absolute().parent.name else self.path
+
+
+SourceError = tuple[str, Path, BadInput]
+
+
+def find_sources(
+    inputs: Iterable[Path],
+    *,
+    category: str | None = None,
+    category_from: Literal["none", "parent"] = "none",
+    masks: str | None = None,
+) -> tuple[list[Source], list[SourceError]]:
+    """The sequences that the paths on a command line stand for, and a row for each path that stands for none.
+
+    Args:
+        inputs: videos, folders of photos, or folders of those; order is kept, folders are read in natural order.
+        category: label of all sources.
+        category_from: "parent" takes the name of the folder above the video or capture where `category` is None.
+        masks: folder of masks. For one source it is the folder itself, for several `masks`/<id>; a "{}" in it
+            stands for the capture's folder or the video's path without its suffix (`{}/masks`, `{}_masks`).
+
+    Returns:
+        Sources with unique ids (the parent's name is prefixed where two are the same), and (id, path, error) rows.
+    """
+    found: list[Source] = []
+    errors: list[SourceError] = []
+    seen: set[Path] = set()
+    for path in inputs:
+        try:
+            sources = list(_expand(path, set(), top=True))
+        except BadInput as error:
+            errors.append((_name(path), path, error))
+            continue
+        for source in sources:
+            place = source.path.resolve()
+            if place not in seen:  # the same video given twice is one sequence
+                seen.add(place)
+                found.append(source)
+    found = [_labelled(source, category, category_from) for source in _with_unique_ids(found)]
+    if masks is None:
+        return found, errors
+    kept: list[Source] = []
+    for source in found:
+        folder = _masks_of(source, masks, several=len(found) > 1)
+        if folder.is_dir():
+            kept.append(replace(source, masks=folder))
+        else:
+            remedy = "--masks is a folder: for several inputs it holds a folder for each id; {} stands for the input"
+            errors.append((source.id, source.path, BadInput("no such folder of masks", where=folder, remedy=remedy)))
+    return kept, errors
+
+
+def source_fingerprint(source: Source) -> dict[str, Any]:
+    """Identifies the content of a source (masks too) by names, sizes and samples of the bytes; JSON values.
+
+    It does not depend on where the source lies. Raises `BadInput` where a file has gone.
+    """
+    value: dict[str, Any] = {"kind": source.kind, "id": source.id, "category": source.category}
+    try:
+        if source.kind == "video":
+            value["files"] = files.quick_fingerprint(source.path)
+        else:
+            value["files"] = _fingerprint_all(list_photos(source.path))
+        if source.masks is not None:
+            value["masks"] = _fingerprint_all(list_photos(source.masks))
+    except OSError as error:
+        raise BadInput(f"cannot be read ({error.strerror})", where=error.filename or source.path) from error
+    return value
+
+
+def _fingerprint_all(paths: list[Path]) -> str:
+    digest = hashlib.sha256()
+    for path in paths:  # 3 x 64 KiB a photo: a folder of a thousand costs well under a second
+        digest.update(files.quick_fingerprint(path, chunk=1 << 16).encode())
+    return f"{len(paths)}:{digest.hexdigest()}"
+
+
+def _expand(path: Path, above: set[Path], *, top: bool) -> Iterator[Source]:
+    """The sources at or below `path`. Raises `BadInput` where the path given by the user (`top`) holds none."""
+    if not path.exists():
+        raise BadInput("no such file or folder", where=path)
+    if path.is_file():
+        if path.suffix.lower() not in VIDEO_SUFFIXES:
+            known = ", ".join(sorted(suffix[1:] for suffix in VIDEO_SUFFIXES))
+            remedy = f"Give videos ({known}) or folders of photos"
+            raise BadInput("is neither a video nor a folder of photos", where=path, remedy=remedy)
+        yield Source(path, _name(path), "video")
+        return
+    try:
+        entries = sorted((p for p in path.iterdir() if not p.name.startswith(".")), key=natural_order)
+    except OSError as error:
+        raise BadInput(f"cannot be read ({error.strerror})", where=path) from error
+    images = path / "images"
+    if images.is_dir() and list_photos(images):
+        yield Source(images, _name(path), "photos")
+        return
+    videos = [entry for entry in entries if entry.suffix.lower() in VIDEO_SUFFIXES and entry.is_file()]
+    for video in videos:
+        yield Source(video, _name(video), "video")
+    has_photos = bool(list_photos(path))
+    if has_photos:
+        yield Source(path, _name(path), "photos")
+    below = False
+    place = path.resolve()
+    if not has_photos and place not in above:  # a link to a folder above would never end
+        for entry in entries:
+            if entry.is_dir() and entry.name.lower() not in NOT_PHOTOS:
+                for source in _expand(entry, above | {place}, top=False):
+                    below = True
+                    yield source
+    if top and not (videos or has_photos or below):
+        raise BadInput(*_nothing_in(entries), where=path, remedy=_remedy(entries))
+
+
+def _nothing_in(entries: list[Path]) -> tuple[str]:
+    return ("is an empty folder",) if not entries else ("holds neither photos nor videos",)
+
+
+def _remedy(entries: list[Path]) -> str:
+    foreign = sorted({e.suffix.lower() for e in entries} & UNSUPPORTED_PHOTOS)
+    if foreign:
+        return f"Convert {', '.join(foreign)} files to JPEG first"
+    known = ", ".join(sorted(suffix[1:] for suffix in PHOTO_SUFFIXES))
+    return f"Photos are {known} files"
+
+
+def _name(path: Path) -> str:
+    path = path.absolute()  # "." and ".." have no name of their own
+    path = path if path.name not in ("", "..") else path.resolve()
+    return sequence_id(path.name if path.is_dir() else path.stem)
+
+
+def _with_unique_ids(sources: list[Source]) -> list[Source]:
+    """Prefix parents' names until no two ids are equal on any file system, then the file type, then a number."""
+    for level in range(1, 5):
+        groups: dict[str, list[int]] = defaultdict(list)
+        for index, source in enumerate(sources):
+            groups[source.id.casefold()].append(index)
+        clashes = [index for group in groups.values() if len(group) > 1 for index in group]
+        if not clashes:
+            return sources
+        for index in clashes:
+            source = sources[index]
+            parents = [p.name for p in source.home.absolute().parents if p.name]
+            if level <= 3:
+                prefix = "_".join(reversed(parents[:level]))
+                name = f"{prefix}_{_name(source.home)}"
+            else:
+                name = f"{source.id}_{source.path.suffix[1:] or 'photos'}"
+            sources[index] = replace(source, id=sequence_id(name))
+    taken: set[str] = set()
+    for index, source in enumerate(sources):
+        name, number = source.id, 2
+        while name.casefold() in taken:
+            name, number = f"{source.id}_{number}", number + 1
+        taken.add(name.casefold())
+        sources[index] = replace(source, id=name)
+    return sources
+
+
+def _labelled(source: Source, category: str | None, category_from: str) -> Source:
+    if category is None and category_from == "parent":
+        category = source.home.absolute().parent.name or None
+    return replace(source, category=category, instance=source.id)
+
+
+def _masks_of(source: Source, masks: str, *, several: bool) -> Path:
+    if "{}" in masks:
+        home = source.home.with_suffix("") if source.kind == "video" else source.home
+        return Path(masks.replace("{}", str(home)))
+    return Path(masks) / source.id if several else Path(masks)
