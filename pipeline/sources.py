@@ -137,7 +137,7 @@ def _expand(path: Path, above: set[Path], *, top: bool) -> Iterator[Source]:
             known = ", ".join(sorted(suffix[1:] for suffix in VIDEO_SUFFIXES))
             remedy = f"Give videos ({known}) or folders of photos"
             raise BadInput("is neither a video nor a folder of photos", where=path, remedy=remedy)
-        yield Source(path, _name(path), "video")
+        yield _source(path, "video")
         return
     try:
         entries = sorted((p for p in path.iterdir() if not p.name.startswith(".")), key=natural_order)
@@ -145,14 +145,14 @@ def _expand(path: Path, above: set[Path], *, top: bool) -> Iterator[Source]:
         raise BadInput(f"cannot be read ({error.strerror})", where=path) from error
     images = path / "images"
     if images.is_dir() and list_photos(images):
-        yield Source(images, _name(path), "photos")
+        yield _source(images, "photos")
         return
     videos = [entry for entry in entries if entry.suffix.lower() in VIDEO_SUFFIXES and entry.is_file()]
     for video in videos:
-        yield Source(video, _name(video), "video")
+        yield _source(video, "video")
     has_photos = bool(list_photos(path))
     if has_photos:
-        yield Source(path, _name(path), "photos")
+        yield _source(path, "photos")
     below = False
     place = path.resolve()
     if not has_photos and place not in above:  # a link to a folder above would never end
@@ -162,11 +162,13 @@ def _expand(path: Path, above: set[Path], *, top: bool) -> Iterator[Source]:
                     below = True
                     yield source
     if top and not (videos or has_photos or below):
-        raise BadInput(*_nothing_in(entries), where=path, remedy=_remedy(entries))
+        what = "holds neither photos nor videos" if entries else "is an empty folder"
+        raise BadInput(what, where=path, remedy=_remedy(entries))
 
 
-def _nothing_in(entries: list[Path]) -> tuple[str]:
-    return ("is an empty folder",) if not entries else ("holds neither photos nor videos",)
+def _source(path: Path, kind: Literal["video", "photos"]) -> Source:
+    source = Source(path, "", kind)
+    return replace(source, id=_name(source.home))
 
 
 def _remedy(entries: list[Path]) -> str:

@@ -1,0 +1,128 @@
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from tiny_media import encode, pan, texture, write_photos
+
+from pipeline.sources import find_sources, source_fingerprint
+
+PHOTO = encode(texture(16, 16))
+
+
+def touch(path: Path, data: bytes = b"x") -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data)
+    return path
+
+
+def photo_folder(folder: Path, n: int = 2) -> Path:
+    for i in range(n):
+        touch(folder / f"{i}.JPG", PHOTO)
+    return folder
+
+
+def ids(*inputs: Path, **options: object) -> list[str]:
+    sources, errors = find_sources(list(inputs), **options)  # type: ignore[arg-type]
+    assert not errors, errors
+    return [source.id for source in sources]
+
+
+def test_videos_of_any_case_and_photo_folders_become_sequences(tmp_path: Path) -> None:
+    video, photos = touch(tmp_path / "My car (1).MOV"), photo_folder(tmp_path / "fox")
+    sources, errors = find_sources([video, photos])
+    assert not errors
+    assert [(s.id, s.kind, s.path) for s in sources] == [("My_car_1", "video", video), ("fox", "photos", photos)]
+
+
+def test_a_capture_takes_its_images_and_the_outer_name(tmp_path: Path) -> None:
+    photo_folder(tmp_path / "fox/images")
+    photo_folder(tmp_path / "fox/masks")
+    touch(tmp_path / "fox/cameras.json")
+    sources, _ = find_sources([tmp_path / "fox"], category_from="parent")
+    assert [(s.id, s.path, s.category) for s in sources] == [("fox", tmp_path / "fox/images", tmp_path.name)]
+    assert ids(tmp_path / "fox/images") == ["fox"], "naming the inner folder is the same capture"
+
+
+def test_folders_expand_to_all_below_in_natural_order(tmp_path: Path) -> None:
+    for name in ("a/10.mp4", "a/9.mp4", "b/x/images/1.jpg", "b/y/1.png", "b/notes/readme.txt", ".hidden/z.mp4"):
+        touch(tmp_path / name, PHOTO)
+    touch(tmp_path / "a/._9.mp4")
+    photo_folder(tmp_path / "a/masks")
+    assert ids(tmp_path) == ["9", "10", "x", "y"]
+    sources, _ = find_sources([tmp_path], category_from="parent")
+    assert [s.category for s in sources] == ["a", "a", "b", "b"]
+    assert {s.category for s in find_sources([tmp_path], category="mug", category_from="parent")[0]} == {"mug"}
+
+
+def test_equal_names_get_their_parents_name_and_stay_unique(tmp_path: Path) -> None:
+    for name in ("car/1.mp4", "cup/1.mp4", "cup/2.mp4", "dog/3.mp4", "dog/3.mov", "Cat/4.mp4", "x/CAT/4.mp4"):
+        touch(tmp_path / name)
+    found = ids(tmp_path)
+    assert {"car_1", "cup_1", "2"} <= set(found)
+    assert len({name.casefold() for name in found}) == 7, "unique where file systems ignore case, too"
+    assert ids(tmp_path) == found
+    assert ids(tmp_path / "cup/2.mp4", tmp_path / "cup/../cup/2.mp4") == ["2"], "the same video twice is one sequence"
+
+
+def test_bad_inputs_are_rows_and_the_others_go_on(tmp_path: Path) -> None:
+    good = touch(tmp_path / "good.mp4")
+    (tmp_path / "empty").mkdir()
+    touch(tmp_path / "text/readme.txt")
+    touch(tmp_path / "phone/a.HEIC")
+    inputs = [tmp_path / "absent.mp4", tmp_path / "empty", tmp_path / "text", tmp_path / "phone", good]
+    sources, errors = find_sources([*inputs, touch(tmp_path / "notes.txt")])
+    assert [s.id for s in sources] == ["good"]
+    assert [path for _, path, _ in errors] == [*inputs[:4], tmp_path / "notes.txt"]
+    texts = [str(error) for *_, error in errors]
+    wanted = ["no such file", "empty folder", "holds neither", "Convert .heic", "neither a video nor"]
+    for text, part in zip(texts, wanted, strict=True):
+        assert part in text and str(tmp_path) in text
+
+
+def test_a_link_to_a_folder_above_ends(tmp_path: Path) -> None:
+    touch(tmp_path / "a/1.mp4")
+    (tmp_path / "a/loop").symlink_to(tmp_path)
+    assert ids(tmp_path) == ["1"]
+
+
+def test_masks_are_found_for_one_and_for_many(tmp_path: Path) -> None:
+    for name in ("fox", "cat"):
+        photo_folder(tmp_path / name / "images")
+    photo_folder(tmp_path / "fox/masks")
+    photo_folder(tmp_path / "all/fox")
+    one, _ = find_sources([tmp_path / "fox"], masks=str(tmp_path / "fox/masks"))
+    assert one[0].masks == tmp_path / "fox/masks"
+    for template in (str(tmp_path / "all"), "{}/masks"):
+        sources, errors = find_sources([tmp_path / "fox", tmp_path / "cat"], masks=template)
+        assert [s.id for s in sources] == ["fox"] and sources[0].masks is not None
+        assert [(name, "no such folder of masks" in str(e)) for name, _, e in errors] == [("cat", True)]
+    touch(tmp_path / "clip.mp4")
+    photo_folder(tmp_path / "clip_masks")
+    assert find_sources([tmp_path / "clip.mp4"], masks="{}_masks")[0][0].masks == tmp_path / "clip_masks"
+
+
+def test_the_fingerprint_follows_content_not_place_or_time(tmp_path: Path) -> None:
+    prints = []
+    for place in ("p", "q"):
+        folder = write_photos(tmp_path / place / "fox", pan(3))
+        masks = photo_folder(tmp_path / place / "masks")
+        os.utime(folder / "IMG_0001.jpg", (1, 1))
+        sources, _ = find_sources([folder], masks=str(masks))
+        prints.append(source_fingerprint(sources[0]))
+    assert prints[0] == prints[1]
+    touch(tmp_path / "q/masks/0.JPG", PHOTO + b"!")
+    assert source_fingerprint(sources[0]) != prints[0], "masks count"
+    touch(tmp_path / "q/masks/0.JPG", PHOTO)
+    (folder / "IMG_0001.jpg").rename(folder / "IMG_0009.jpg")
+    assert source_fingerprint(sources[0]) != prints[0], "names count"
+
+
+@pytest.mark.captures
+def test_the_captures_are_found() -> None:
+    captures = Path(__file__).parents[2].parent / "shared/data/captures"
+    if not captures.is_dir() or os.environ.get("CI") == "true":
+        pytest.skip("the real captures are not here")
+    sources, errors = find_sources([captures])
+    assert {s.id for s in sources} >= {"fox", "plush_doll", "skull"} and not errors
