@@ -1,0 +1,238 @@
+"""The settings of a training run: one frozen dataclass, two presets, and `load_config` that resolves them.
+
+The defaults are the paper's, so `TrainConfig()` and the preset `paper` are the same run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, Literal
+
+from dope.augmentation import AugmentationConfig
+from dope.common import settings
+from dope.common.errors import UsageError
+from dope.networks import NetworkConfig
+
+PRESETS = Path(__file__).parent / "presets"
+RESULT_NEUTRAL = ("data.workers", "device", "validation", "checkpoint", "log_every")
+"""Settings that do not change what is learnt: a run may be resumed with other values of these."""
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """What a batch is made of."""
+
+    image_size: int = 224
+    """Side of the images in pixels, a multiple of 32; the loader resizes the views and scales their points."""
+    batch_size: int = 256
+    """Pairs in a step over all ranks together; incomplete batches are dropped."""
+    pairs_per_object: int = 1
+    """Pairs of each object in an epoch (1 in the paper)."""
+    points: int = 32
+    """Corresponding points a pair, by farthest point sampling on view 1."""
+    max_points: int = 4096
+    """Correspondences read of a pair: the first ones, which the shards keep in farthest-point order."""
+    workers: int = 8
+    """Processes on each rank that decode; 0 decodes in the training process."""
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Contrastive loss over points, and cross entropy on the mask."""
+
+    temperature: float = 0.1
+    """Divides the dot products."""
+    negatives: Literal["both", "other_objects", "second_view"] = "both"
+    """Negatives of a point: other points of its object in view 2, all points of other objects, or both."""
+    mask_weight: float = 1.0
+    """Weight of the mask loss against the contrastive loss; 0 leaves it out."""
+    chunk: int = 2048
+    """Queries whose logits are in memory at a time."""
+
+
+@dataclass(frozen=True)
+class OptimiserConfig:
+    """AdamW."""
+
+    lr: float = 1e-4
+    """Highest learning rate."""
+    weight_decay: float = 1e-2
+    """Decoupled weight decay."""
+    betas: tuple[float, float] = (0.9, 0.999)
+    """Decay rates of the two moments."""
+
+
+@dataclass(frozen=True)
+class ScheduleConfig:
+    """How long, and how the learning rate falls."""
+
+    epochs: int = 3000
+    """Passes in which each object is seen `data.pairs_per_object` times."""
+    shape: Literal["cosine", "constant"] = "cosine"
+    """Cosine to 0 at the end, or constant."""
+    per: Literal["epoch", "step"] = "epoch"
+    """Whether the rate changes once an epoch (the paper) or every step."""
+    warmup_steps: int = 0
+    """Steps of linear rise from 0 (the paper has none)."""
+
+
+@dataclass(frozen=True)
+class ValidationConfig:
+    """PCK and mask IoU on held-out pairs (split `val`), before the first step, every so often, and at the end."""
+
+    every: int = 50
+    """Epochs between two validations; 0 turns them off."""
+    pairs: int = 256
+    """Pairs used: the first ones of the split, which hold each object once before any twice."""
+    batch_size: int = 32
+    """Pairs encoded at a time on a rank."""
+
+
+@dataclass(frozen=True)
+class CheckpointConfig:
+    """RUN/checkpoints/step-XXXXXXXX.pt; one is always written at the end and on SIGTERM."""
+
+    every: int = 50
+    """Epochs between two checkpoints; 0 writes only the last."""
+    keep: int = 0
+    """The newest checkpoints to keep; 0 keeps all of them."""
+
+
+@dataclass(frozen=True)
+class DistributedConfig:
+    """What changes with more than one rank."""
+
+    sync_batchnorm: bool = False
+    """BatchNorm statistics of the online encoder over all ranks (CUDA only)."""
+    shuffle_batchnorm: bool = True
+    """Shuffle the momentum encoder's images over the ranks, so that BatchNorm does not give pairs away (MoCo)."""
+    local_negatives: bool = False
+    """Contrast with the own rank's keys only, as the released code: the loss then depends on the number of ranks."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything that decides what a training run does."""
+
+    data: DataConfig = field(default_factory=DataConfig)
+    """Images, batches and points."""
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    """Encoder, mask head and projector."""
+    augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
+    """Colour, geometry and background of each view."""
+    pairs: Literal["two_views", "one_view_twice"] = "two_views"
+    """Two cameras, or one image augmented twice (ablation)."""
+    loss: LossConfig = field(default_factory=LossConfig)
+    """Contrastive and mask loss."""
+    optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
+    """AdamW."""
+    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
+    """Epochs and learning rate."""
+    momentum: float = 0.999
+    """Share of the momentum encoder that stays at each step."""
+    distributed: DistributedConfig = field(default_factory=DistributedConfig)
+    """Only matters with more than one rank."""
+    validation: ValidationConfig = field(default_factory=ValidationConfig)
+    """PCK on held-out pairs."""
+    checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)
+    """What is saved, and when."""
+    precision: Literal["fp32", "bf16"] = "fp32"
+    """bf16 runs the encoders in autocast; losses stay in fp32. Slow on most CPUs."""
+    device: str = "auto"
+    """auto (CUDA where there is one), cpu, cuda or cuda:N."""
+    log_every: int = 10
+    """Steps between two lines of metrics.jsonl."""
+    seed: int = 12345
+    """Everything random derives from it."""
+
+
+def preset_names() -> list[str]:
+    """Names that `load_config` knows, sorted."""
+    return sorted(path.stem for path in PRESETS.glob("*.yaml"))
+
+
+def load_config(preset: str | None = None, yaml: Path | None = None, overrides: Iterable[str] = ()) -> TrainConfig:
+    """Resolve a run's settings: the preset, on top of it a YAML file, on top of it `key=value` overrides.
+
+    Raises:
+        UsageError: an unknown preset or key (the closest known one is named), a value of the wrong type or range.
+    """
+    values: dict[str, Any] = {}
+    if preset is not None:
+        if preset not in preset_names():
+            close = get_close_matches(preset, preset_names(), n=1)
+            hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(preset_names())}"
+            raise UsageError(f"unknown preset '{preset}' ({hint})", where="--preset")
+        values = settings.load_yaml(PRESETS / f"{preset}.yaml")
+    if yaml is not None:
+        values = _merged(values, settings.load_yaml(yaml))
+    where = str(yaml) if yaml is not None else f"preset {preset}"
+    config = settings.override(settings.from_mapping(TrainConfig, values, where=where), overrides)
+    check(config)
+    return config
+
+
+def check(config: TrainConfig) -> None:
+    """Raise `UsageError` naming the first setting whose value makes no sense."""
+    data, schedule = config.data, config.schedule
+    rules = (
+        ("data.image_size", data.image_size >= 32 and data.image_size % 32 == 0, "must be a positive multiple of 32"),
+        ("data.batch_size", data.batch_size >= 2, "must be at least 2: the other pairs of a batch are the negatives"),
+        ("data.pairs_per_object", data.pairs_per_object >= 1, "must be at least 1"),
+        ("data.points", data.points >= 1, "must be at least 1"),
+        ("data.max_points", data.max_points >= data.points, "must not be less than data.points"),
+        ("data.workers", data.workers >= 0, "must not be negative"),
+        ("loss.temperature", config.loss.temperature > 0, "must be positive"),
+        ("loss.mask_weight", config.loss.mask_weight >= 0, "must not be negative"),
+        ("loss.chunk", config.loss.chunk >= 1, "must be at least 1"),
+        ("optimiser.lr", config.optimiser.lr > 0, "must be positive"),
+        ("schedule.epochs", schedule.epochs >= 1, "must be at least 1"),
+        ("schedule.warmup_steps", schedule.warmup_steps >= 0, "must not be negative"),
+        ("momentum", 0 <= config.momentum <= 1, "must lie in [0, 1]"),
+        ("validation.every", config.validation.every >= 0, "must not be negative"),
+        ("validation.pairs", config.validation.pairs >= 1, "must be at least 1 (validation.every=0 turns it off)"),
+        ("validation.batch_size", config.validation.batch_size >= 1, "must be at least 1"),
+        ("checkpoint.every", config.checkpoint.every >= 0, "must not be negative"),
+        ("checkpoint.keep", config.checkpoint.keep >= 0, "must not be negative"),
+        ("log_every", config.log_every >= 1, "must be at least 1"),
+    )
+    for key, ok, rule in rules:
+        if not ok:
+            value: Any = config
+            for part in key.split("."):
+                value = getattr(value, part)
+            raise UsageError(f"'{value}' {rule}", where=key, remedy=f"Change it with --set {key}=...")
+
+
+def differing_keys(ours: dict[str, Any], theirs: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """Settings that differ between two configs given as plain dicts: dotted key -> (ours, theirs).
+
+    Those of `RESULT_NEUTRAL` are left out; a key that only one side has counts as None on the other.
+    """
+    left, right = _flat(ours), _flat(theirs)
+    return {
+        key: (left.get(key), right.get(key))
+        for key in sorted(left.keys() | right.keys())
+        if left.get(key) != right.get(key) and not any(key == n or key.startswith(n + ".") for n in RESULT_NEUTRAL)
+    }
+
+
+def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{prefix}{key}.")
+        else:
+            flat[prefix + key] = list(value) if isinstance(value, tuple) else value
+    return flat
+
+
+def _merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    merged = dict(below)
+    for key, value in above.items():
+        inner = merged.get(key)
+        merged[key] = _merged(inner, value) if isinstance(inner, dict) and isinstance(value, dict) else value
+    return merged

@@ -1,0 +1,121 @@
+"""Ranks: one process, or one of several that `torchrun` started. The same code path for both."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import timedelta
+from typing import Any
+
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+
+from dope.common.errors import UsageError
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """This process among all of a run.
+
+    Attributes:
+        rank, world: number of this process and how many there are.
+        device: where this process computes.
+    """
+
+    rank: int
+    world: int
+    device: torch.device
+
+    @property
+    def is_first(self) -> bool:
+        """True on the rank that writes files and talks."""
+        return self.rank == 0
+
+    def gather(self, tensor: Tensor) -> Tensor:
+        """Concatenate equal-shaped (b, ...) tensors of all ranks, in the order of ranks; no gradient."""
+        if self.world == 1:
+            return tensor
+        tensor = tensor.contiguous()
+        raw = tensor.view(torch.uint8) if tensor.dtype == torch.bool else tensor  # gloo and nccl lack bool
+        parts = [torch.empty_like(raw) for _ in range(self.world)]
+        dist.all_gather(parts, raw)
+        return torch.cat(parts).view(tensor.dtype)
+
+    def sum(self, tensor: Tensor) -> Tensor:
+        """Sum over ranks, a new tensor; no gradient."""
+        tensor = tensor.detach().clone()
+        if self.world > 1:
+            dist.all_reduce(tensor)
+        return tensor
+
+    def share(self, tensor: Tensor) -> Tensor:
+        """This rank's part of a tensor that holds equal parts of all ranks."""
+        return tensor.chunk(self.world)[self.rank] if self.world > 1 else tensor
+
+    def copy_from_first(self, module: nn.Module) -> None:
+        """Give every rank the first rank's parameters and buffers."""
+        if self.world > 1:
+            for tensor in module.state_dict().values():
+                dist.broadcast(tensor, 0)
+
+    def collect(self, value: Any) -> list[Any]:
+        """The values of all ranks, in the order of ranks."""
+        values: list[Any] = [value] * self.world
+        if self.world > 1:
+            dist.all_gather_object(values, value)
+        return values
+
+    def wait(self) -> None:
+        """Return when all ranks are here."""
+        if self.world > 1:
+            dist.barrier()
+
+
+@contextmanager
+def ranks_of(device: str) -> Iterator[Ranks]:
+    """Join the run that torchrun's environment describes, or be the only rank; leave it at the end.
+
+    Args:
+        device: auto, cpu, cuda or cuda:N; with several ranks, cuda means the GPU of the local rank.
+
+    Raises:
+        UsageError: an unknown or absent device.
+    """
+    world = int(os.environ.get("WORLD_SIZE", "1"))
+    rank, local = int(os.environ.get("RANK", "0")), int(os.environ.get("LOCAL_RANK", "0"))
+    chosen = pick_device(device, local if world > 1 else 0)
+    if chosen.type == "cuda":
+        torch.cuda.set_device(chosen)
+    if world == 1:
+        yield Ranks(0, 1, chosen)
+        return
+    backend = "nccl" if chosen.type == "cuda" else "gloo"
+    dist.init_process_group(backend, timeout=timedelta(minutes=20))
+    try:
+        yield Ranks(rank, world, chosen)
+    finally:
+        dist.destroy_process_group()
+
+
+def pick_device(name: str, local_rank: int = 0) -> torch.device:
+    """The torch device that a setting means. Raises `UsageError` where there is no such device."""
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise UsageError(f"'{name}' is no device", where="device", remedy="Use auto, cpu, cuda or cuda:N") from None
+    if device.type != "cuda":
+        return device
+    device = torch.device("cuda", local_rank if device.index is None else device.index)
+    if not torch.cuda.is_available() or device.index >= torch.cuda.device_count():
+        found = torch.cuda.device_count() if torch.cuda.is_available() else 0
+        raise UsageError(
+            f"there is no {device}: PyTorch sees {found} GPUs",
+            where="device",
+            remedy="Use --set device=cpu, fewer processes, or the CUDA build of PyTorch",
+        )
+    return device

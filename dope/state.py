@@ -1,0 +1,77 @@
+"""All that changes while training: weights, momentum copy, optimiser, and the place in the run."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import torch
+from torch import nn
+from torch.nn.parallel import DistributedDataParallel
+
+from dope.common.errors import UsageError
+from dope.common.seeds import derive_seed
+from dope.config import TrainConfig
+from dope.distributed import Ranks
+from dope.networks import DopeNetwork, MomentumEncoder
+from dope.order import Place
+from dope.step import OnlineEncoder
+
+
+@dataclass
+class TrainState:
+    """What a checkpoint holds.
+
+    Attributes:
+        step: optimiser steps done.
+        place: place in the order of samples.
+        validation: newest result of `dope.validation.pck`, and that of the untrained network.
+    """
+
+    network: DopeNetwork
+    momentum: MomentumEncoder
+    optimiser: torch.optim.Optimizer
+    step: int = 0
+    place: Place = field(default_factory=Place)
+    validation: dict[str, float] | None = None
+    untrained: dict[str, float] | None = None
+
+
+def new_state(config: TrainConfig, ranks: Ranks) -> TrainState:
+    """An untrained network with its momentum copy and optimiser, the same on every rank."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(derive_seed(config.seed, "weights"))
+        network = DopeNetwork(config.network)
+    momentum = MomentumEncoder(network, config.momentum).to(ranks.device)
+    if config.distributed.sync_batchnorm and ranks.world > 1:
+        if ranks.device.type != "cuda":
+            raise UsageError("needs CUDA", where="distributed.sync_batchnorm", remedy="Set it to false")
+        network = nn.SyncBatchNorm.convert_sync_batchnorm(network)
+    network = network.to(ranks.device).train()
+    options = config.optimiser
+    optimiser = torch.optim.AdamW(
+        network.parameters(), options.lr, betas=options.betas, weight_decay=options.weight_decay, fused=True
+    )
+    return TrainState(network, momentum, optimiser)
+
+
+def wrap(network: DopeNetwork, ranks: Ranks) -> nn.Module:
+    """The online encoder, its gradients averaged over ranks where there are several."""
+    online = OnlineEncoder(network)
+    if ranks.world == 1:
+        return online
+    return DistributedDataParallel(online, device_ids=[ranks.device] if ranks.device.type == "cuda" else None)
+
+
+def learning_rate(config: TrainConfig, step: int, steps_per_epoch: int) -> float:
+    """The learning rate of step `step` (from 0): linear warm-up, then cosine to 0 or constant."""
+    schedule, peak = config.schedule, config.optimiser.lr
+    if step < schedule.warmup_steps:
+        return peak * (step + 1) / (schedule.warmup_steps + 1)
+    if schedule.shape == "constant":
+        return peak
+    if schedule.per == "epoch":
+        share = (step // steps_per_epoch) / schedule.epochs
+    else:
+        share = (step - schedule.warmup_steps) / max(1, schedule.epochs * steps_per_epoch - schedule.warmup_steps)
+    return peak * 0.5 * (1 + math.cos(math.pi * share))
