@@ -1,0 +1,81 @@
+"""All augmentation of single views; pairs are two lists of them."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dope.augmentation import background, colour, geometry
+from dope.augmentation.config import AugmentationConfig
+from dope.augmentation.draws import Draws, on_device
+
+PIXELS_AT_ONCE = 1 << 18  # on CPUs: the few views at a time that stay in the cache between operations
+COLUMNS = 1 + colour.COLUMNS + geometry.COLUMNS + background.COLUMNS
+
+
+@torch.no_grad()
+def augment_images(
+    images: Tensor, masks: Tensor, config: AugmentationConfig, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Augment views that come alone: each loses its background with `config.single_background_p`.
+
+    Args:
+        images: (B, 3, H, W) uint8, or float in [0, 1].
+        masks: (B, 1, H, W) bool. A view with an empty mask keeps its background.
+        config: probabilities and ranges; `background_removal` "off" keeps every background.
+        generator: the result is a function of it and of the inputs.
+
+    Returns:
+        images (B, 3, H, W) float32 in [0, 1] and masks (B, 1, H, W) bool.
+    """
+    draw = torch.rand(len(images), generator=generator, device=generator.device).to(images.device)
+    remove = (draw < config.single_background_p) & (config.background_removal != "off")
+    new_images, new_masks, _ = augment_views(images, masks, remove, config, generator)
+    return new_images, new_masks
+
+
+@torch.no_grad()
+def augment_views(
+    images: Tensor, masks: Tensor, remove: Tensor, config: AugmentationConfig, generator: torch.Generator
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Change colours, flip, and where `remove` (n,): move the object and paint a new background.
+
+    Returns:
+        images (n, 3, H, W) float32, masks (n, 1, H, W) bool, and the matrices (n, 3, 3) that map points of the old
+        views to the new ones.
+    """
+    n, _, height, width = images.shape
+    draws = Draws(n, COLUMNS, generator, images.device)
+    noise_generator = on_device(generator, images.device)
+    flip = draws.chance(config.flip_p)
+    colours = colour.draw_colour(draws, config)
+    backgrounds = background.draw_backgrounds(draws, config)
+
+    remove = remove & masks.flatten(1).any(1)
+    masks = torch.where(flip[:, None, None, None], masks.flip(-1), masks)
+    moves, moved, scales = geometry.draw_moves(draws, masks, remove & config.geometry, config)
+
+    result = torch.empty(images.shape, dtype=torch.float32, device=images.device)
+    at_once = n if images.is_cuda else max(1, PIXELS_AT_ONCE // (height * width))
+    with torch.autocast(images.device.type, enabled=False):
+        for start in range(0, n, at_once):
+            rows = slice(start, start + at_once)
+            part = to_float(torch.where(flip[rows, None, None, None], images[rows].flip(-1), images[rows]))
+            colour.change_colours(part, colours[rows])
+            moving = moved[rows].nonzero()[:, 0]
+            if len(moving):
+                part[moving], masks[start + moving] = geometry.warp(
+                    part[moving], masks[start + moving], moves[start + moving], scales[start + moving]
+                )
+            removing = remove[rows].nonzero()[:, 0]
+            if len(removing):
+                painted = background.paint(backgrounds[start + removing], height, width, config.noise, noise_generator)
+                part[removing] = torch.where(masks[start + removing], part[removing], to_float(painted))
+            result[rows] = part
+        matrices = moves @ geometry.flips(flip, width)
+    return result, masks, matrices
+
+
+def to_float(images: Tensor) -> Tensor:
+    """uint8 images as float32 in [0, 1]; a copy of float images."""
+    return images.to(torch.float32, copy=True) if images.is_floating_point() else images.float().div_(255)
