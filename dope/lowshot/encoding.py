@@ -66,6 +66,11 @@ class ViewCells:
         return self._descriptors.shape[1]
 
     @property
+    def largest_nbytes(self) -> int:
+        """Memory once all cells are projected."""
+        return len(self) * (self._descriptors.element_size() * self.dim + self.cells.itemsize + self.norms.itemsize)
+
+    @property
     def norm_map(self) -> NDArray[np.float32]:
         """Norms on the grid, (h, w)."""
         norms = np.empty(len(self), np.float32)
@@ -102,11 +107,15 @@ def encode_views(
     *,
     device: torch.device | str = "cpu",
     batch: int = 16,
+    image_size: int | None = None,
     progress: Progress | None = None,
 ) -> Iterator[tuple[int, ViewCells]]:
-    """Encode views once each, in order: (index, cells). The network must be in eval mode."""
+    """Encode views once each, in order: (index, cells). The network must be in eval mode.
+
+    `image_size` is the side in pixels that it was trained with; views of another size are resized.
+    """
     done = 0
-    for images in views.batches(indices, batch):
+    for images in views.batches(indices, batch, image_size=image_size):
         for cells in encode(network, to_tensor(images, device)):
             yield int(indices[done]), cells
             done += 1

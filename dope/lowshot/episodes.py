@@ -90,8 +90,8 @@ def sample_episodes(population: Population, config: EpisodeConfig) -> Episodes:
         UsageError: a number out of range, or too few classes, objects or views for what is asked (unless `fit`).
     """
     _check_numbers(config)
+    population = classes_of(population, config)
     if config.classes == "instance":
-        population = _objects_as_classes(population)
         config = replace(config, shot_mode="several_instances")  # an instance's shots are views of it either way
     pools = {name: _Pool.of(population[name].values(), config) for name in sorted(population)}
     config, names = _suited(pools, config)
@@ -104,6 +104,17 @@ def sample_episodes(population: Population, config: EpisodeConfig) -> Episodes:
         rows = np.nonzero(classes == number)
         support[rows], query[rows] = pools[name].draw(rng, len(rows[0]), config)
     return Episodes(support, query, classes, names, config, tuple(name for name in pools if name not in names))
+
+
+def classes_of(population: Population, config: EpisodeConfig) -> Population:
+    """What is told apart: the categories as they are, or each object as a class whose "objects" are its views."""
+    if config.classes == "category":
+        return population
+    return {
+        f"{name}/{obj}" if name else obj: {str(view): [view] for view in views}
+        for name, objects in population.items()
+        for obj, views in objects.items()
+    }
 
 
 @dataclass(frozen=True)
@@ -169,15 +180,6 @@ def _distinct(rng: np.random.Generator, rows: int, n: int | Indices, k: int, *, 
             order[line, j], order[line, part[:, j]] = order[line, part[:, j]], order[line, j]
         chosen[start : start + step] = order[:, :k]
     return chosen
-
-
-def _objects_as_classes(population: Population) -> Population:
-    """Each object a class, each of its views an "object" with one view."""
-    return {
-        f"{name}/{obj}" if name else obj: {str(view): [view] for view in views}
-        for name, objects in population.items()
-        for obj, views in objects.items()
-    }
 
 
 def _check_numbers(config: EpisodeConfig) -> None:

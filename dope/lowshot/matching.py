@@ -20,7 +20,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dope.common.seeds import generator
+from dope.common.seeds import derive_seed
+from dope.farthest_points import farthest_points
 from dope.lowshot.episodes import Episodes, Indices
 
 _LEVELS = (0.3, 0.05)  # norms at which the search for a better match may end: the object, its soft border, then all
@@ -60,24 +61,15 @@ def query_cells(norms: NDArray[np.float32], key: str, config: MatchingConfig) ->
         key: the view's key; with the seed it makes the draw independent of batches and of the other views.
         config: number of points, threshold, seed.
     """
-    rng = generator(config.seed, "query cells", key)
+    seed = derive_seed(config.seed, "query cells", key)
     foreground = np.flatnonzero(norms >= config.foreground)
     if len(foreground) < config.points:
-        return np.sort(rng.choice(norms.size, config.points, replace=norms.size < config.points)).astype(np.int64)
-    cells = np.stack(np.unravel_index(foreground, norms.shape), axis=1).astype(np.float32)
-    return foreground[farthest_points(cells, config.points, int(rng.integers(len(cells))))]
-
-
-def farthest_points(points: NDArray[np.float32], k: int, first: int) -> NDArray[np.int64]:
-    """Indices (k,) of points (N, 2), k <= N, each the farthest from those before it; ties go to the lowest index."""
-    chosen = np.empty(k, np.int64)
-    chosen[0] = first
-    nearest = np.full(len(points), np.inf, np.float32)
-    for i in range(1, k):
-        offset = points - points[chosen[i - 1]]
-        np.minimum(nearest, np.einsum("nd,nd->n", offset, offset), out=nearest)
-        chosen[i] = nearest.argmax()
-    return chosen
+        rng = np.random.default_rng(seed)
+        return rng.choice(norms.size, config.points, replace=norms.size < config.points).astype(np.int64)
+    cells = torch.from_numpy(np.stack(np.unravel_index(foreground, norms.shape), axis=1)).float()
+    valid = torch.ones(1, len(cells), dtype=torch.bool)
+    chosen, _ = farthest_points(cells[None], valid, config.points, torch.Generator().manual_seed(seed))
+    return foreground[chosen[0].numpy()]
 
 
 def best_similarities(queries: Tensor, query_norms: Tensor, support: SupportCells) -> Tensor:

@@ -63,15 +63,20 @@ class ViewShards:
         """The image alone, (H, W, 3) uint8 RGB."""
         return np.ascontiguousarray(self._decode(index, self._members(index), "jpg", cv2.IMREAD_COLOR)[..., ::-1])
 
-    def batches(self, indices: Sequence[int] | NDArray[np.integer], size: int) -> Iterator[NDArray[np.uint8]]:
-        """Images of `indices` in batches (B, H, W, 3) uint8 RGB; the next one is decoded while one is in use."""
+    def batches(
+        self, indices: Sequence[int] | NDArray[np.integer], size: int, *, image_size: int | None = None
+    ) -> Iterator[NDArray[np.uint8]]:
+        """Images of `indices` in batches (B, H, W, 3) uint8 RGB; the next one is decoded while one is in use.
+
+        With `image_size` views of another size become squares of that side, as in training.
+        """
         chunks = [indices[start : start + size] for start in range(0, len(indices), size)]
         with ThreadPoolExecutor(1) as pool:
-            pending = [pool.submit(self._batch, chunk) for chunk in chunks[:2]]
+            pending = [pool.submit(self._batch, chunk, image_size) for chunk in chunks[:2]]
             for number in range(len(chunks)):
                 batch = pending.pop(0).result()
                 if number + 2 < len(chunks):
-                    pending.append(pool.submit(self._batch, chunks[number + 2]))
+                    pending.append(pool.submit(self._batch, chunks[number + 2], image_size))
                 yield batch
 
     def select(self, split: str = "all", categories: Sequence[str] = ()) -> NDArray[np.int64]:
@@ -141,13 +146,22 @@ class ViewShards:
             raise BadInput(what, where=self.folder / self.columns["shard"][index], remedy=REMAKE)
         return image
 
-    def _batch(self, indices: Sequence[int] | NDArray[np.integer]) -> NDArray[np.uint8]:
-        images = [self.image(int(i)) for i in indices]
+    def _batch(self, indices: Sequence[int] | NDArray[np.integer], image_size: int | None) -> NDArray[np.uint8]:
+        images = [resized(self.image(int(i)), image_size) for i in indices]
         for i, image in zip(indices, images, strict=True):
             if image.shape != images[0].shape:
                 what = f"view {self.columns['key'][int(i)]} is {image.shape[1]}x{image.shape[0]} px, others are not"
                 raise BadInput(what, where=self.folder, remedy="All views of a folder of shards have one size")
         return np.stack(images)
+
+
+def resized(image: NDArray[Any], image_size: int | None) -> NDArray[Any]:
+    """The image as a square of `image_size` pixels, as the training loader makes it; as it is where None."""
+    if image_size is None or image.shape[:2] == (image_size, image_size):
+        return image
+    shrinks = min(image.shape[:2]) >= image_size
+    interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return cv2.resize(image, (image_size, image_size), interpolation=interpolation)
 
 
 def _read_columns(folder: Path) -> dict[str, list[Any]]:

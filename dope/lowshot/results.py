@@ -1,0 +1,165 @@
+"""Result rows: what was measured, on what, with which weights; kept in Parquet or JSON, printed as a table."""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from dope.common import files
+from dope.common.errors import BadInput, UsageError
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+OUTCOME = ("accuracy", "ci95")
+
+
+@dataclass(frozen=True)
+class ResultRow:
+    """One protocol of one network on one dataset."""
+
+    network: str
+    """"trained", or "untrained" for the same network with random weights."""
+    classifier: str
+    """local (1-NN by local matching) or centroid (nearest mean of pooled descriptors)."""
+    classes: str
+    """category or instance."""
+    ways: int
+    """Classes an episode, as drawn."""
+    shots: int
+    """Labelled views a class."""
+    shot_mode: str
+    """several_instances or one_instance."""
+    queries: int
+    """Queries a class, as drawn."""
+    episodes: int
+    """Number of episodes."""
+    seed: int
+    """Seed of the episodes."""
+    accuracy: float
+    """Mean over episodes, 0 to 1."""
+    ci95: float
+    """Half the 95% confidence interval: 1.96 * standard deviation over episodes / sqrt(episodes)."""
+    chance: float
+    """1 / ways."""
+    n_classes: int
+    """Classes the episodes were drawn from."""
+    n_objects: int
+    """Their objects."""
+    n_views: int
+    """Their views."""
+    asked_ways: int
+    """What was asked for: larger than `ways` where --fit reduced it."""
+    asked_queries: int
+    """What was asked for: larger than `queries` where --fit reduced it."""
+    split: str
+    """Split of the shards: all, train or val."""
+    dataset: str
+    """Fingerprint of the views."""
+    checkpoint: str | None
+    """File name of the weights; None for random ones."""
+    checkpoint_sha256: str | None
+    """SHA-256 of that file."""
+    step: int | None
+    """Training steps behind the weights."""
+    config_hash: str
+    """Of the training run (trained) or of the network's settings (untrained)."""
+    evaluation_hash: str
+    """Of the evaluation's settings other than those above."""
+
+    @property
+    def protocol(self) -> str:
+        return f"{self.ways}-way {self.shots}-shot"
+
+
+def append_rows(path: Path, rows: Iterable[ResultRow]) -> list[ResultRow]:
+    """Add rows to a .parquet or .json file, in order; a row measured before is replaced. Returns all rows.
+
+    Raises:
+        UsageError: another suffix.
+        BadInput: the file is there and cannot be read.
+    """
+    _check_suffix(path)
+    merged = {_identity(row): row for row in (read_rows(path) if path.exists() else [])}
+    merged |= {_identity(row): row for row in rows}
+    _write(path, list(merged.values()))
+    return list(merged.values())
+
+
+def read_rows(path: Path) -> list[ResultRow]:
+    """Read what `append_rows` wrote. Raises `BadInput` where the file is absent or not of result rows."""
+    _check_suffix(path)
+    if path.suffix == ".json":
+        values = files.read_json(path)
+    else:
+        try:
+            values = pq.read_table(path).to_pylist()
+        except FileNotFoundError:
+            raise BadInput("no such file", where=path, remedy="`dope eval` writes it") from None
+        except (pa.ArrowException, OSError) as error:
+            raise BadInput(f"cannot be read ({error})", where=path) from error
+    known = {field.name for field in dataclasses.fields(ResultRow)}
+    try:
+        return [ResultRow(**{key: value for key, value in row.items() if key in known}) for row in values]
+    except (TypeError, AttributeError) as error:
+        raise BadInput(f"does not hold result rows ({error})", where=path, remedy="`dope eval` writes it") from error
+
+
+def results_table(rows: Sequence[ResultRow], title: str = "Low-shot recognition") -> Table:
+    """The rows as a table for the terminal: accuracy in % with its 95% confidence interval, beside chance."""
+    from rich.table import Table
+
+    table = Table(title=title)
+    for name in ("protocol", "of", "classifier", "network", "views"):
+        table.add_column(name)
+    for name in ("accuracy %", "chance %", "episodes"):
+        table.add_column(name, justify="right")
+    for row in rows:
+        several = row.shot_mode == "several_instances" or row.shots == 1
+        reduced = row.ways < row.asked_ways or row.queries < row.asked_queries
+        table.add_row(
+            row.protocol + ("" if several else ", one object") + (f" (asked: {row.asked_ways}-way)" if reduced else ""),
+            f"{row.n_classes} {'categories' if row.classes == 'category' else 'objects'}",
+            row.classifier,
+            row.network + (f", step {row.step}" if row.step is not None else ""),
+            f"{row.n_views} ({row.split})",
+            f"{100 * row.accuracy:.2f} ± {100 * row.ci95:.2f}",
+            f"{100 * row.chance:.1f}",
+            f"{row.episodes}",
+        )
+    return table
+
+
+def _identity(row: ResultRow) -> tuple[Any, ...]:
+    values = dataclasses.asdict(row)
+    return tuple(value for name, value in values.items() if name not in OUTCOME)
+
+
+def _write(path: Path, rows: Sequence[ResultRow]) -> None:
+    values = [dataclasses.asdict(row) for row in rows]
+    if path.suffix == ".json":
+        files.write_json(path, values)
+        return
+    with files.atomic_path(path) as partial:
+        pq.write_table(pa.Table.from_pylist(values, schema=_schema()), partial)
+
+
+def _schema() -> pa.Schema:
+    kinds = {int: pa.int64(), float: pa.float64(), str: pa.string()}
+    fields = []
+    for name, hint in typing.get_type_hints(ResultRow).items():
+        plain = next((kind for kind in typing.get_args(hint) if kind is not type(None)), hint)
+        fields.append((name, kinds[plain]))
+    return pa.schema(fields)
+
+
+def _check_suffix(path: Path) -> None:
+    if path.suffix not in (".parquet", ".json"):
+        raise UsageError("results are kept in a .parquet or .json file", where=path)
