@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dope.common import files
-from dope.common.errors import BadInput
+from dope.common.errors import BadInput, UsageError
 from pipeline.photos import decode, list_photos, read_jpeg_header, turn_upright
 from pipeline.sequence import Frame, Sequence, write_image
 
@@ -85,6 +85,27 @@ def import_masks(sequence: Sequence, folder: Path, config: MasksConfig) -> dict[
     sequence.write_frames(frames)
     missing = [frame.source_name for frame in shown if frame.mask is None]
     return mask_details(shares, missing, empty)
+
+
+def find_mask_folders(given: str, ids: list[str]) -> dict[str, Path]:
+    """The folder of masks of each sequence: `given`/<id>, or `given` itself where there is one sequence only.
+
+    "{}" in `given` stands for the sequence's id. Sequences without a folder are left out.
+
+    Raises:
+        UsageError: not one of the sequences has a folder of masks.
+    """
+    if "{}" in given:
+        folders = {name: Path(given.replace("{}", name)) for name in ids}
+    elif len(ids) == 1 and not (Path(given) / ids[0]).is_dir():
+        folders = {ids[0]: Path(given)}
+    else:
+        folders = {name: Path(given) / name for name in ids}
+    there = {name: folder for name, folder in folders.items() if folder.is_dir()}
+    if not there:
+        expected = ", ".join(str(folder) for folder in list(folders.values())[:3])
+        raise UsageError("holds no folder of masks for any sequence", where=given, remedy=f"Expected {expected}")
+    return there
 
 
 def mask_details(shares: list[float], missing: list[str], empty: list[str]) -> dict[str, Any]:

@@ -16,11 +16,12 @@ from pipeline import stages
 from pipeline.children import ChildFailed, Limits, Notify, run_in_child
 from pipeline.correspondences import CorrespondConfig, correspond
 from pipeline.engines import holding, run_items
-from pipeline.masks import MasksConfig, import_masks, mask_files
+from pipeline.frames import FramesConfig, extract_frames
+from pipeline.masks import MasksConfig, import_masks
 from pipeline.mvs import DepthConfig, compute_depth
 from pipeline.sequence import Sequence
 from pipeline.sfm import SfmConfig, reconstruct
-from pipeline.sources import FramesConfig, Source, source_fingerprint
+from pipeline.sources import Source, folder_fingerprint, source_fingerprint
 from pipeline.stages import StageResult, run_stage
 
 
@@ -179,8 +180,6 @@ def _colmap_marks(config: ColmapConfig, inputs: Any) -> dict[str, str]:
 def _prepare_one(
     folder: Path, source: Source, inputs: Any, config: ColmapConfig, options: RunOptions, notify: Notify
 ) -> list[StageResult]:
-    from pipeline.videos import extract_frames
-
     sequence = Sequence(folder)
     marks = _colmap_marks(config, inputs)
     again: dict[str, Any] = {"overwrite": options.overwrite, "retry_failed": options.retry_failed}
@@ -205,7 +204,7 @@ def _marks(sequence: Sequence, *names: str) -> dict[str, str | None]:
 
 
 def _masks_inputs(sequence: Sequence, folder: Path | None) -> dict[str, Any]:
-    files = None if folder is None else mask_files(folder)
+    files = None if folder is None else folder_fingerprint(folder)
     return {**_marks(sequence, "frames", "sfm"), "files": files}
 
 
