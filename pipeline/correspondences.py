@@ -196,7 +196,8 @@ def correspond(sequence: Sequence, config: CorrespondConfig) -> dict[str, Any]:
     details: dict[str, Any] = {"views": len(rows), "views_with_depth": len(surfaces), "frames_skipped": dict(skipped)}
     table, pair_details = _match_pairs(surfaces, config)
     with files.atomic_path(sequence.correspondences) as partial:
-        pq.write_table(pa.Table.from_pylist(table, PAIR_SCHEMA), partial, row_group_size=ROW_GROUP)
+        rows_table = pa.Table.from_pylist(table, PAIR_SCHEMA)
+        pq.write_table(rows_table, partial, row_group_size=ROW_GROUP, use_dictionary=False)  # coordinates do not repeat
     details |= pair_details
     if not table:
         details["empty"] = _why_empty(details)

@@ -53,16 +53,24 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     """Yield an empty temporary folder beside `path`; on success it takes the place of `path`, else it is deleted."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY}")
+    old = partial.with_name(f"{partial.name}.old")
     shutil.rmtree(partial, ignore_errors=True)
     with explaining_full_disk(path):
         try:
             partial.mkdir()
             yield partial
-            if path.exists():
-                shutil.rmtree(path)
-            partial.replace(path)
+            try:
+                if path.exists():
+                    path.replace(old)  # two renames: the moment without either folder does not grow with its size
+                partial.replace(path)
+            except BaseException:
+                if old.exists() and not path.exists():
+                    old.replace(path)
+                raise
         finally:
             shutil.rmtree(partial, ignore_errors=True)
+            if path.exists():
+                shutil.rmtree(old, ignore_errors=True)
 
 
 def write_bytes(path: Path, data: bytes) -> None:
