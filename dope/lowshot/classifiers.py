@@ -14,7 +14,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dope.lowshot.encoding import Progress, ViewCells, encode_views, to_tensor
+from dope.common.progress import Progress
+from dope.lowshot.encoding import ViewCells, encode_views, to_tensor
 from dope.lowshot.episodes import Episodes, Indices
 from dope.lowshot.matching import MatchingConfig, PairScores, nearest_shot, query_cells, score_support
 from dope.lowshot.views import ViewShards

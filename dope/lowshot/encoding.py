@@ -16,6 +16,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
+from dope.common.progress import Progress
 from dope.lowshot.views import ViewShards
 from dope.networks import NetworkOutput
 
@@ -29,10 +30,6 @@ class Encoder(Protocol):
     def __call__(self, images: Tensor) -> NetworkOutput: ...
 
     def project(self, cell_features: Tensor) -> Tensor: ...
-
-
-Progress = Callable[[str, int, int], None]
-"""Called with what is being done, how many are done, and of how many."""
 
 
 class ViewCells:

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from dope.common import settings
 from dope.common.errors import UsageError
+from dope.common.progress import Progress
 from dope.common.seeds import derive_seed
 from dope.lowshot.classifiers import Work, classify_by_centroid, classify_locally
-from dope.lowshot.encoding import Progress
 from dope.lowshot.episodes import EpisodeConfig, Episodes, Population, classes_of, sample_episodes
 from dope.lowshot.matching import MatchingConfig
 from dope.lowshot.results import ResultRow
