@@ -10,8 +10,8 @@ What counts as object in a mask file, whatever its bit depth:
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,13 +19,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dope.common import files
 from dope.common.errors import BadInput, UsageError
-from pipeline.photos import decode, list_photos, read_jpeg_header, turn_upright
-from pipeline.sequence import Frame, Sequence, write_image
-
-LISTED = 10
-"""Names listed in the details before only the count is given."""
+from pipeline.grabcut import GrabCutConfig
+from pipeline.mask_io import read_mask_values, write_masks
+from pipeline.photos import list_photos, read_jpeg_header, turn_upright
+from pipeline.sequence import Frame, Sequence
 
 
 @dataclass(frozen=True)
@@ -38,6 +36,8 @@ class MasksConfig:
     """Object is above this share of the largest value that the mask's type can hold."""
     min_share: float = 0.0005
     """A mask with a smaller share of object pixels is empty."""
+    grabcut: GrabCutConfig = field(default_factory=GrabCutConfig)
+    """How the object is cut out where no masks are given."""
 
 
 def import_masks(sequence: Sequence, folder: Path, config: MasksConfig) -> dict[str, Any]:
@@ -53,6 +53,7 @@ def import_masks(sequence: Sequence, folder: Path, config: MasksConfig) -> dict[
 
     Raises:
         BadInput: no such folder, a mask that cannot be read or has another size, no mask matches, all are empty.
+            The masks that were there before are untouched then.
     """
     if not folder.is_dir():
         raise BadInput("no such folder of masks", where=folder)
@@ -66,25 +67,15 @@ def import_masks(sequence: Sequence, folder: Path, config: MasksConfig) -> dict[
         how = "the frame's number from 0, e.g. 000012.png" if by_number else "the photo's name, e.g. IMG_1.png"
         raise BadInput(f"no mask belongs to any frame ({names} ...)", where=folder, remedy=f"A mask's name is {how}")
     cutoff = config.threshold if _any_above(found.values(), config.threshold) else 0.0
-    shares: list[float] = []
-    empty: list[str] = []
-    with files.atomic_folder(sequence.masks) as partial:
-        for frame in frames:
-            path = found.get(frame.frame)
-            frame.mask = None
-            if path is None:
-                continue
-            mask = _fitted(read_mask_values(path) > cutoff, frame, path, Path(info.source))
-            frame.mask = f"masks/{frame.frame:06d}.png"
-            write_image(partial / f"{frame.frame:06d}.png", mask.astype(np.uint8) * 255)
-            shares.append(float(mask.mean()))
-            if shares[-1] < config.min_share:
-                empty.append(frame.source_name)
-        if len(empty) == len(shares):
-            raise BadInput("all masks are empty", where=folder, remedy="Object pixels are bright, the others black")
-    sequence.write_frames(frames)
-    missing = [frame.source_name for frame in shown if frame.mask is None]
-    return mask_details(shares, missing, empty)
+
+    def fitted() -> Iterator[tuple[Frame, NDArray[np.bool_]]]:
+        for frame in shown:
+            if frame.frame in found:
+                path = found[frame.frame]
+                yield frame, _fitted(read_mask_values(path) > cutoff, frame, path, Path(info.source))
+
+    nothing = BadInput("all masks are empty", where=folder, remedy="Object pixels are bright, the others black")
+    return write_masks(sequence, frames, fitted(), min_share=config.min_share, nothing=nothing)
 
 
 def find_mask_folders(given: str, ids: list[str]) -> dict[str, Path]:
@@ -108,34 +99,6 @@ def find_mask_folders(given: str, ids: list[str]) -> dict[str, Path]:
     return there
 
 
-def mask_details(shares: list[float], missing: list[str], empty: list[str]) -> dict[str, Any]:
-    """The details that both ways to masks report. `shares`: object's share of each mask written."""
-    share = round(float(np.mean(shares)), 4) if shares else 0.0
-    details: dict[str, Any] = {"masks": len(shares), "missing": len(missing), "empty": len(empty), "mean_share": share}
-    for key, names in (("missing_frames", missing), ("empty_frames", empty)):
-        if names:
-            more = [f"... {len(names) - LISTED} more"] if len(names) > LISTED else []
-            details[key] = names[:LISTED] + more
-    return details
-
-
-def read_mask_values(path: Path) -> NDArray[np.float32]:
-    """A mask file's values (height, width) in [0, 1]. Raises `BadInput` where it cannot be decoded."""
-    try:
-        image = decode(path.read_bytes(), cv2.IMREAD_UNCHANGED)
-    except OSError as error:
-        raise BadInput(f"cannot be read ({error.strerror})", where=path) from error
-    except BadInput as error:
-        raise BadInput(error.what, where=path) from error
-    largest = np.iinfo(image.dtype).max if np.issubdtype(image.dtype, np.integer) else 1.0
-    if image.ndim == 3:
-        alpha = image[..., -1] if image.shape[2] in (2, 4) else None
-        informative = alpha is not None and alpha.min() != alpha.max()
-        colours = image[..., :-1] if alpha is not None else image
-        image = alpha if alpha is not None and informative else colours.max(axis=2)
-    return (image / np.float32(largest)).astype(np.float32)
-
-
 def _match(frames: list[Frame], folder: Path, *, by_number: bool) -> dict[int, Path]:
     """Mask files of frames, by frame index."""
     named: dict[str, Path] = {}
@@ -150,14 +113,9 @@ def _match(frames: list[Frame], folder: Path, *, by_number: bool) -> dict[int, P
     return {f.frame: numbered[int(f.source_name)] for f in frames if int(f.source_name) in numbered}
 
 
-def _any_above(paths: Any, threshold: float) -> bool:
+def _any_above(paths: Iterable[Path], threshold: float) -> bool:
     """Does any mask reach the threshold? The first nearly always does, so this seldom reads a second."""
-    return any(float(values.max(initial=0)) > threshold for values in _values(paths))
-
-
-def _values(paths: Any) -> Iterator[NDArray[np.float32]]:
-    for path in paths:
-        yield read_mask_values(path)
+    return any(float(read_mask_values(path).max(initial=0)) > threshold for path in paths)
 
 
 def _fitted(mask: NDArray[np.bool_], frame: Frame, path: Path, photos: Path) -> NDArray[np.bool_]:

@@ -12,7 +12,8 @@ from tiny_media import encode, pan, with_orientation, write_photos, write_video
 
 from dope.common.errors import BadInput
 from pipeline.frames import FramesConfig, extract_frames
-from pipeline.masks import MasksConfig, import_masks, read_mask_values
+from pipeline.mask_io import read_mask_values
+from pipeline.masks import MasksConfig, import_masks
 from pipeline.sequence import Sequence
 from pipeline.sources import Source, find_sources
 
