@@ -171,6 +171,8 @@ class HashingFile:
         self.digest = hashlib.sha256()
 
     def write(self, data: bytes) -> int:
+        if self.file.closed:  # an archive that was given up after an error flushes its rest when it is collected
+            return len(data)
         self.digest.update(data)
         return self.file.write(data)
 
