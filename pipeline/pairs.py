@@ -12,6 +12,9 @@ from dope.common import seeds
 from pipeline.geometry import Camera
 
 
+GIVE_UP = 100  # pairs of one range of angle that fail in a row: the views of long videos make thousands of the kind
+
+
 @dataclass(frozen=True)
 class PairsConfig:
     """Which pairs of views are chosen."""
@@ -71,6 +74,7 @@ def select_pairs(
     edges = np.linspace(config.min_angle_deg, config.max_angle_deg, config.angle_bins + 1)[1:-1]
     bins = np.digitize(angles[pairs[:, 0], pairs[:, 1]], edges)
     waiting = [pairs[bins == b] for b in range(config.angle_bins)]
+    failed = [0] * config.angle_bins
     used = np.zeros(len(cameras), dtype=np.int64)
     chosen: list[NDArray[np.intp]] = []
     while any(map(len, waiting)) and len(chosen) < config.max_pairs:
@@ -83,5 +87,9 @@ def select_pairs(
                 if overlap is None or overlap(int(pair[0]), int(pair[1])) >= config.min_overlap:
                     used[pair] += 1
                     chosen.append(pair)
+                    failed[b] = 0
                     break
+                failed[b] += 1
+                if failed[b] >= GIVE_UP:
+                    waiting[b] = waiting[b][:0]
     return np.array(chosen, dtype=np.intp).reshape(-1, 2)

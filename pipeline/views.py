@@ -92,10 +92,15 @@ class View:
 def sample_frames(frames: list[Frame], config: ViewsConfig) -> list[Frame]:
     """Every `every`-th of the kept frames, in order of their numbers; short sequences are sampled more densely."""
     kept = sorted((frame for frame in frames if frame.dropped is None), key=lambda frame: frame.frame)
+    return kept[:: sampling_step(len(kept), config)]
+
+
+def sampling_step(n_frames: int, config: ViewsConfig) -> int:
+    """Every how many of `n_frames` kept frames one is taken."""
     step = max(1, config.every)
-    while step > 1 and math.ceil(len(kept) / step) < config.min_views:
+    while step > 1 and math.ceil(n_frames / step) < config.min_views:
         step -= 1
-    return kept[::step]
+    return step
 
 
 def build_views(sequence: Sequence, config: ViewsConfig, skipped: Counter[str] | None = None) -> Iterator[View]:

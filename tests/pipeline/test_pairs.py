@@ -66,6 +66,19 @@ def test_little_overlap_is_replaced_by_other_pairs() -> None:
     assert len(select_pairs(RING, ORIGIN, lambda i, j: 0.0, config)) == 0
 
 
+def test_hopeless_ranges_of_angle_are_given_up() -> None:
+    """Without this, thousands of wide pairs of a long video would be tried one by one."""
+    many, asked = orbit(120, elevation_deg=0, wobble=0.0), []
+
+    def overlap(i: int, j: int) -> float:
+        asked.append((i, j))
+        return float(min(j - i, 120 - j + i) < 10)  # nothing beyond 30 degrees
+
+    pairs = select_pairs(many, ORIGIN, overlap, PairsConfig(max_pairs=100))
+    assert len(pairs) == 100 and len(asked) < 700
+    assert view_angles_deg(many, ORIGIN)[pairs[:, 0], pairs[:, 1]].max() < 30
+
+
 def test_the_choice_depends_on_the_seed_alone() -> None:
     config = PairsConfig(max_pairs=30)
     first, again = (select_pairs(RING, ORIGIN, None, config) for _ in range(2))
