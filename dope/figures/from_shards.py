@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from dope.common.errors import UsageError
+from dope.common.errors import BadInput, UsageError
 from dope.figures.colouring import Colours, correspondence_colouring
 from dope.figures.heatmap import Point, similarity_heatmap
 from dope.lowshot.evaluate import untrained_network
@@ -52,16 +52,18 @@ def draw_figures(
 
     Raises:
         UsageError: an unknown sequence (close ones are named), fewer than two views, or a point outside the view.
-        BadInput: shards or checkpoint cannot be used, or the view shows no object.
+        BadInput: shards or checkpoint cannot be used; or, once all others are drawn, a sequence shows no object.
     """
     if views < 2:
         raise UsageError(f"a figure needs at least 2 views, not {views}", where="--views")
     found = ViewShards(shards)
     chosen = [(name, found.of_sequence(name)) for name in sequences or _first_sequences(found, limit)]
-    network, image_size, weights = _network(checkpoint, device)
     for sequence, indices in chosen:
         if len(indices) < 2:
             raise UsageError(f"sequence '{sequence}' has only one view", where=shards)
+    network, image_size, weights = _network(checkpoint, device)
+    failed: list[BadInput] = []
+    for sequence, indices in chosen:
         indices = evenly_spaced(indices, views)
         read = [found.read(i) for i in indices.tolist()]
         photos = [view.image for view in read]
@@ -69,17 +71,23 @@ def draw_figures(
         names = [f"frame {found.columns['frame'][i]}" for i in indices]
         subtitle = f"{sequence}, {weights}, {masks} masks"
         path = out / f"{sequence}-{kind}.png"
-        if kind == "colouring":
-            correspondence_colouring(
-                network, photos, path, masks=given, colours=colours, names=names, subtitle=subtitle,
-                image_size=image_size, device=device,
-            )  # fmt: skip
-        else:
-            similarity_heatmap(
-                network, photos, point, path, masks=given, names=names, subtitle=subtitle,
-                image_size=image_size, device=device,
-            )  # fmt: skip
+        try:
+            if kind == "colouring":
+                correspondence_colouring(
+                    network, photos, path, masks=given, colours=colours, names=names, subtitle=subtitle,
+                    image_size=image_size, device=device,
+                )  # fmt: skip
+            else:
+                similarity_heatmap(
+                    network, photos, point, path, masks=given, names=names, subtitle=subtitle,
+                    image_size=image_size, device=device,
+                )  # fmt: skip
+        except BadInput as error:  # one sequence without a visible object does not cost the others their figures
+            failed.append(BadInput(error.what, where=f"{sequence}, {error.where}", remedy=error.remedy))
+            continue
         yield path
+    if failed:
+        raise failed[0]
 
 
 def figure_for(shards: Path, checkpoint: Path | None, sequence: str, kind: Kind, out: Path, **options: Any) -> Path:

@@ -113,28 +113,44 @@ def read_rows(path: Path) -> list[ResultRow]:
 
 
 def results_table(rows: Sequence[ResultRow], title: str = "Low-shot recognition") -> Table:
-    """The rows as a table for the terminal: accuracy in % with its 95% confidence interval, beside chance."""
+    """The rows as a table for the terminal: accuracy in % with its 95% confidence interval, beside chance.
+
+    What all rows have in common is said once, below the table.
+    """
     from rich.table import Table
 
-    table = Table(title=title)
-    for name in ("protocol", "of", "classifier", "network", "views"):
+    table = Table(title=title, caption_justify="left")
+    details = {
+        "of": [f"{row.n_classes} {'categories' if row.classes == 'category' else 'objects'}" for row in rows],
+        "views": [f"{row.n_views} views ({row.split})" for row in rows],
+        "classifier": [{"local": "local matching"}.get(row.classifier, row.classifier) for row in rows],
+        "queries": [f"{row.queries} queries a class" for row in rows],
+        "episodes": [f"{row.episodes:,} episodes" for row in rows],
+    }
+    common = [values[0] for values in details.values() if len(set(values)) == 1]
+    table.caption = ", ".join(common)
+    varying = {name: values for name, values in details.items() if len(set(values)) > 1}
+    for name in ("protocol", "network", *varying):
         table.add_column(name)
-    for name in ("accuracy %", "chance %", "episodes"):
-        table.add_column(name, justify="right")
-    for row in rows:
-        several = row.shot_mode == "several_instances" or row.shots == 1
-        reduced = row.ways < row.asked_ways or row.queries < row.asked_queries
-        table.add_row(
-            row.protocol + ("" if several else ", one object") + (f" (asked: {row.asked_ways}-way)" if reduced else ""),
-            f"{row.n_classes} {'categories' if row.classes == 'category' else 'objects'}",
-            row.classifier,
-            row.network + (f", step {row.step}" if row.step is not None else ""),
-            f"{row.n_views} ({row.split})",
-            f"{100 * row.accuracy:.2f} ± {100 * row.ci95:.2f}",
-            f"{100 * row.chance:.1f}",
-            f"{row.episodes}",
-        )
+    table.add_column("accuracy %", justify="right", no_wrap=True)
+    table.add_column("chance %", justify="right", no_wrap=True)
+    for i, row in enumerate(rows):
+        trained = row.network + (f", step {row.step}" if row.step is not None else "")
+        accuracy = f"{100 * row.accuracy:.2f} ± {100 * row.ci95:.2f}"
+        cells = [values[i] for values in varying.values()]
+        table.add_row(_protocol(row), trained, *cells, accuracy, f"{100 * row.chance:.1f}")
     return table
+
+
+def _protocol(row: ResultRow) -> str:
+    """Ways and shots, with what was asked for where --fit reduced it."""
+    asked = []
+    if row.ways < row.asked_ways:
+        asked.append(f"{row.asked_ways}-way")
+    if row.queries < row.asked_queries:
+        asked.append(f"{row.asked_queries} queries")
+    one_object = row.shots > 1 and row.shot_mode == "one_instance"
+    return row.protocol + (" of one object" if one_object else "") + (f" (asked: {', '.join(asked)})" if asked else "")
 
 
 def _identity(row: ResultRow) -> tuple[Any, ...]:

@@ -1,7 +1,8 @@
 from __future__ import annotations
 
+import io
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -259,12 +260,20 @@ def test_files_that_are_no_results_are_named(tmp_path: Path) -> None:
         read_rows(tmp_path / "other.json")
 
 
-def test_the_table_shows_accuracy_beside_chance() -> None:
+def test_the_table_fits_a_terminal_and_shows_accuracy_beside_chance() -> None:
     from rich.console import Console
 
-    console = Console(width=200, record=True, file=open("/dev/null", "w"))  # noqa: SIM115, PTH123
-    console.print(results_table([row(), row(ways=3, asked_ways=5, shots=5, shot_mode="one_instance")]))
-    text = console.export_text()
-    assert "62.76 ± 0.41" in text and "20.0" in text and "5-way 1-shot" in text
-    assert "one object" in text and "asked: 5-way" in text
-    assert asdict(row())["accuracy"] == 0.6276
+    def shown(*rows: ResultRow) -> str:
+        console = Console(width=80, record=True, file=io.StringIO())
+        console.print(results_table(rows))
+        return console.export_text()
+
+    text = shown(row(), row(network="untrained", step=None, shots=5))
+    assert "62.76 ± 0.41" in text and "20.0" in text and "5-way 1-shot" in text and "trained, step 1" in text
+    assert "10 categories, 3000 views (all), local matching, 15 queries a class, 2,500 episodes" in " ".join(
+        text.split()
+    )
+    reduced = shown(row(ways=3, shots=5, shot_mode="one_instance"))
+    assert "of one object" in reduced and "5-way)" in reduced
+    several = shown(row(), row(classes="instance", n_classes=30))
+    assert "30 objects" in several and "10 categories" in several

@@ -229,3 +229,21 @@ def test_unknown_sequences_and_too_few_views_are_explained(shards: Path, tmp_pat
         list(draw_figures(None, alone, tmp_path))
     with pytest.raises(UsageError, match="only one view"):
         figure_for(alone, None, "shape0_object0", "colouring", tmp_path)
+
+
+def test_one_sequence_without_an_object_does_not_stop_the_others(
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class SeesObjectsOnce(CoordinateNetwork):
+        calls = 0
+
+        def descriptors(self, images: Tensor) -> Tensor:
+            SeesObjectsOnce.calls += 1
+            return super().descriptors(images) * (SeesObjectsOnce.calls > 2)
+
+    monkeypatch.setattr(from_shards, "_network", lambda checkpoint, device: (SeesObjectsOnce(), None, "fake"))
+    drawn = []
+    with pytest.raises(BadInput, match="shape0_object2, frame 0: the network sees no object"):
+        for path in draw_figures(None, shards, tmp_path, views=2, limit=2):
+            drawn.append(path.name)
+    assert drawn == ["shape0_object0-colouring.png"]
