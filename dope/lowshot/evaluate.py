@@ -94,6 +94,7 @@ def evaluate(
         raise UsageError("no protocol to evaluate", where="--ways, --shots")
     views = ViewShards(shards)
     chosen = views.select(config.split, config.categories)
+    dataset = views.fingerprint
     populations = [_population(views, chosen, protocol) for protocol in config.protocols]
     episodes = [sample_episodes(*both) for both in zip(populations, config.protocols, strict=True)]
 
@@ -112,7 +113,7 @@ def evaluate(
             accuracies.append((predicted == truth).mean((1, 2)))
             accuracy, ci95 = mean_and_ci95(accuracies[-1])
             columns = {**weights, **_counts(population, drawn), **_settings_of(config, asked, drawn)}
-            rows.append(ResultRow(accuracy=accuracy, ci95=ci95, dataset=views.fingerprint, **columns))
+            rows.append(ResultRow(accuracy=accuracy, ci95=ci95, dataset=dataset, **columns))
     n_episodes = sum(map(len, episodes)) * len(networks)
     return EvaluationResult(
         tuple(rows),

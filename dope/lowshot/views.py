@@ -57,7 +57,12 @@ class ViewShards:
         members = self._members(index)
         image = self._decode(index, members, "jpg", cv2.IMREAD_COLOR)
         mask = self._decode(index, members, "png", cv2.IMREAD_GRAYSCALE) > 127
-        return View(np.ascontiguousarray(image[..., ::-1]), mask, json.loads(members.get("json", b"{}")))
+        try:
+            info = json.loads(members["json"])
+        except (KeyError, ValueError) as error:
+            what = f"{self.columns['key'][index]}.json is missing or damaged"
+            raise BadInput(what, where=self.folder / self.columns["shard"][index], remedy=REMAKE) from error
+        return View(np.ascontiguousarray(image[..., ::-1]), mask, info)
 
     def image(self, index: int) -> NDArray[np.uint8]:
         """The image alone, (H, W, 3) uint8 RGB."""
@@ -130,7 +135,7 @@ class ViewShards:
         names = sorted(set(self.columns["shard"]))
         manifest = self.folder / "dataset.json"
         listed = files.read_json(manifest).get("shards", {}) if manifest.is_file() else {}
-        hashes = [[name, listed[name]["sha256"] if name in listed else None] for name in names]
+        hashes = [[name, listed.get(name, {}).get("sha256")] for name in names]
         table = [[self.columns[name][i] for name in COLUMNS] for i in range(len(self))]
         return sha256(json.dumps([hashes, table], default=str).encode()).hexdigest()[:16]
 
