@@ -25,8 +25,9 @@ from dope.common import files, seeds
 from dope.common.errors import BadInput, UsageError
 from dope.common.settings import config_hash
 from pipeline.demo import matroska
-from pipeline.demo.scene import FAR_RING, LOWEST_ELEVATION_DEG, build_scene, render_colours, render_mask
+from pipeline.demo.scene import build_scene, render_colours, render_mask
 from pipeline.demo.shapes import FAMILIES
+from pipeline.demo.surroundings import FAR_RING, LOWEST_ELEVATION_DEG
 from pipeline.geometry import Camera, Floats
 
 CODECS = {"mp4": "mp4v", "mov": "mp4v", "avi": "MJPG", "mkv": "MJPG", "webm": "VP80"}
@@ -62,6 +63,8 @@ class FilmConfig:
     """Standard deviation of the sensor's noise in grey levels."""
     samples: int = 2
     """Samples a pixel in each direction (antialiasing)."""
+    detail: float = 1.0
+    """Resolution of textures and shadows; 1 suits 640 px, less is faster."""
 
 
 @dataclass(frozen=True)
@@ -169,9 +172,9 @@ def film_one(out: Path, job: Job) -> None:
     """Render one object's video, masks and truth."""
     truth = truth_path(out, job)
     truth.unlink(missing_ok=True)
-    for stale in (out / job.family).glob(f"{job.id}.*"):  # the same object from a run with another container
-        stale.unlink()
-    scene = build_scene(job.family, job.seed)
+    for container in CODECS:  # the same object from a run with other containers
+        (out / job.family / f"{job.id}.{container}").unlink(missing_ok=True)
+    scene = build_scene(job.family, job.seed, job.film.detail)
     cameras = camera_path(job.film, scene.height, job.seed)
     rng = seeds.generator(job.seed, "sensor")
     video = video_path(out, job)

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from dope.common import files
 from dope.common.errors import DopeError
-from pipeline.demo.film import DemoConfig, film_objects
+from pipeline.demo.film import DemoConfig, FilmConfig, film_objects
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,9 @@ class Plan:
 
 FULL = Plan(DemoConfig(), train=(), episodes=1000, ways=4, queries=4)
 TINY = Plan(
-    DemoConfig(per_family=2, training_families=("chair", "mug"), novel_families=("bottle", "table"), frames=18),
+    DemoConfig(
+        per_family=2, training_families=("chair", "mug"), novel_families=("bottle", "table"), film=FilmConfig(frames=18)
+    ),
     train=("schedule.epochs=2", "data.pairs_per_object=4", "data.batch_size=4"),
     episodes=20,
     ways=2,

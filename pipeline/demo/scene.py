@@ -15,20 +15,14 @@ from numpy.typing import NDArray
 
 from dope.common import seeds
 from pipeline.demo import shapes
+from pipeline.demo.light import Light
 from pipeline.demo.raster import Panel, Visible, project, rasterise
-from pipeline.demo.solids import box, cylinder, ellipsoid, placed, turn_about
-from pipeline.demo.textures import SolidTexture, painted_plane, random_texture
+from pipeline.demo.surroundings import clutter, room
+from pipeline.demo.textures import SolidTexture, random_texture
 from pipeline.geometry import Camera, Floats
 
 OBJECT_TEXELS, CLUTTER_TEXELS = 320, 190
 """Texels a unit of length on the object and on the things around it."""
-SHADOW_TEXELS, SHADOW_REACH = 130, 5.6
-"""Resolution of the light's depth map a unit of length, and half its side."""
-ROOM_RADIUS, ROOM_WALLS = 5.6, 6
-NEAR_RING, FAR_RING = (0.95, 1.5), (3.7, 4.9)
-"""Distances from the object at which things stand around; the camera moves between the two rings."""
-LOWEST_ELEVATION_DEG = 22.0
-"""Nothing hides the object from a camera at or above this elevation: near things are kept low enough."""
 _PAD = 2
 
 
@@ -84,14 +78,17 @@ def render_colours(scene: Scene, camera: Camera, samples: int = 2) -> NDArray[np
     return np.asarray(cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def build_scene(family: str, seed: int) -> Scene:
-    """The world of one instance: object, clutter, room and light, all drawn from (family, seed)."""
+def build_scene(family: str, seed: int, detail: float = 1.0) -> Scene:
+    """The world of one instance: object, clutter, room and light, all drawn from (family, seed).
+
+    `detail` multiplies the resolution of everything that is painted; 1 suits videos of 640 px.
+    """
     rng = seeds.generator("demo", "scene", family, seed)
     parts = shapes.make_object(family, seed)
-    items = [(part.grids, random_texture(rng, part.name), OBJECT_TEXELS) for part in parts]
+    items = [(part.grids, random_texture(rng, part.name), OBJECT_TEXELS * detail) for part in parts]
     n_object = len(items)
     reach = max(float(np.hypot(grid[..., 0], grid[..., 1]).max()) for part in parts for grid in part.grids)
-    items += [(grids, random_texture(rng), CLUTTER_TEXELS) for grids in _clutter(rng, reach)]
+    items += [(grids, random_texture(rng), CLUTTER_TEXELS * detail) for grids in clutter(rng, reach)]
 
     charts: list[_Chart] = []
     for number, (grids, texture, texels) in enumerate(items):
@@ -102,7 +99,7 @@ def build_scene(family: str, seed: int) -> Scene:
     faces = np.concatenate([_grid_faces(chart.grid) + start for chart, start in zip(charts, starts, strict=False)])
     is_object = np.concatenate([np.full(len(_grid_faces(chart.grid)), chart.is_object) for chart in charts])
 
-    light = _Light.cast(rng, vertices, faces)
+    light = Light.cast(rng, vertices, faces, detail)
     atlas = np.zeros((*shape, 3), np.uint8)
     for chart in charts:
         points, normals = chart.surface()
@@ -111,7 +108,8 @@ def build_scene(family: str, seed: int) -> Scene:
         window[:] = np.clip(255 * colours, 0, 255).reshape(window.shape)
     height = max(float(grid[..., 2].max()) for part in parts for grid in part.grids)
     uv = np.concatenate([chart.uv() for chart in charts])
-    return Scene(vertices, faces, is_object, uv, atlas, _room(rng, light, vertices, faces), height)
+    panels = room(rng, light, vertices, faces, detail)
+    return Scene(vertices, faces, is_object, uv, atlas, panels, height)
 
 
 def _visible(scene: Scene, camera: Camera) -> Visible:
@@ -214,150 +212,3 @@ def _pack(charts: Sequence[_Chart]) -> tuple[int, int]:
         chart.x, chart.y = x, y
         x += chart.width
     return y + shelf, width
-
-
-def _clutter(rng: np.random.Generator, object_reach: float) -> list[tuple[Floats, ...]]:
-    """Boxes, balls, drums and cones around the object, none standing between it and a camera."""
-    slope = np.tan(np.radians(LOWEST_ELEVATION_DEG))
-    placed_at: list[tuple[Floats, float]] = []
-    things: list[tuple[Floats, ...]] = []
-    for ring, count, sizes in ((NEAR_RING, 9, (0.09, 0.17)), (FAR_RING, 11, (0.2, 0.5))):
-        for _ in range(count * 6):
-            if len(things) >= (9 if ring is NEAR_RING else 20):
-                break
-            radius, angle, distance = rng.uniform(*sizes), rng.uniform(0, 2 * np.pi), rng.uniform(*ring)
-            at = distance * np.array([np.cos(angle), np.sin(angle)])
-            if any(np.linalg.norm(at - other) < 1.1 * (radius + r) for other, r in placed_at):
-                continue
-            tall = radius * rng.uniform(0.6, 2.6)
-            if ring is NEAR_RING:
-                tall = min(tall, (distance - radius - object_reach) * slope)
-                if tall < 0.03:
-                    continue
-            placed_at.append((at, radius))
-            things.append(_thing(rng, radius, tall, at))
-    return things
-
-
-def _thing(rng: np.random.Generator, radius: float, tall: float, at: Floats) -> tuple[Floats, ...]:
-    """One piece of clutter that fits a cylinder of that radius and height."""
-    match rng.integers(4):
-        case 0:
-            size = np.array([np.cos(a := rng.uniform(0.5, 1.0)), np.sin(a), 0]) * 2 * radius
-            grids = box(size + np.array([0, 0, tall]), (0, 0, tall / 2), 0.06)
-        case 1:
-            grids = cylinder(radius, 0, tall)
-        case 2:
-            ball = min(radius, tall / 2)
-            grids = ellipsoid((ball, ball, ball), (0, 0, ball))
-        case _:
-            grids = cylinder(radius, 0, tall, radius * rng.uniform(0.2, 0.7))
-    return placed(grids, turn=turn_about(2, float(rng.uniform(0, 360))), shift=(*at, 0))
-
-
-@dataclass(frozen=True)
-class _Light:
-    """A lamp far away, the sky, and the lamp's view of the scene for shadows.
-
-    Attributes:
-        frame: (3, 3) rows: the light map's x and y in the world, and the direction to the lamp.
-        key, sky: (3,) RGB strengths.
-        heights: (S, S) float32, the nearest surface to the lamp at each texel of the light map (-inf: none).
-    """
-
-    frame: Floats
-    key: Floats
-    sky: Floats
-    heights: NDArray[np.float32]
-
-    @classmethod
-    def cast(cls, rng: np.random.Generator, vertices: Floats, faces: NDArray[np.int64]) -> _Light:
-        elevation, azimuth = np.radians(rng.uniform(48, 68)), rng.uniform(0, 2 * np.pi)
-        to_lamp = np.array(
-            [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
-        )
-        x = np.array([-np.sin(azimuth), np.cos(azimuth), 0])
-        frame = np.stack([x, np.cross(to_lamp, x), to_lamp])
-        warm = rng.uniform(-0.05, 0.05)
-        key, sky = (
-            rng.uniform(0.72, 0.85) * np.array([1 + warm, 1, 1 - warm]),
-            rng.uniform(0.42, 0.5) * np.array([0.97, 1, 1.04]),
-        )
-        heights = _seen_along(frame, vertices, faces)
-        return cls(frame, key, sky, heights)
-
-    def on(self, points: Floats, normals: Floats) -> Floats:
-        """Light (N, 3) that reaches surface points (N, 3) with unit normals (N, 3)."""
-        facing = np.maximum(normals @ self.frame[2], 0)
-        # off the surface along the normal: a point must not shade itself
-        local = (points + 0.025 * normals) @ self.frame.T
-        at = (local[:, :2] + SHADOW_REACH) * SHADOW_TEXELS
-        size = self.heights.shape[0]
-        open_share = np.zeros(len(points))
-        for dx, dy in np.ndindex(3, 3):
-            column = np.clip((at[:, 0] + dx - 1).astype(int), 0, size - 1)
-            row = np.clip((at[:, 1] + dy - 1).astype(int), 0, size - 1)
-            open_share += self.heights[row, column] < local[:, 2]
-        # the ground takes away half the sky from what looks down, more from what is close to it
-        near_ground = np.clip(points[:, 2] / 0.22, 0, 1)
-        sky = (0.68 + 0.32 * normals[:, 2]) * (0.7 + 0.3 * near_ground)
-        return self.key * (facing * open_share / 9)[:, None] + self.sky * sky[:, None]
-
-    def on_ground(self, panel: Panel, vertices: Floats, faces: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """The panel's picture, a part of z = 0, lit and with the shadows of everything on it."""
-        height, width = panel.texture.shape[:2]
-        lamp = cv2.GaussianBlur(np.isfinite(self.heights).astype(np.float32), (0, 0), 1.8)
-        low = np.where(vertices[:, 2:] < 0.1, vertices, np.nan)
-        contact = np.isfinite(_seen_along(np.eye(3), low, faces)).astype(np.float32)
-        above = cv2.GaussianBlur(contact, (0, 0), 0.07 * SHADOW_TEXELS)
-        shades = []
-        for frame, shade in ((self.frame, lamp), (np.eye(3), above)):
-            # texel index of the panel -> texel index of the map, both half a step from positions
-            world = np.stack([panel.right, panel.down, panel.origin + 0.5 * (panel.right + panel.down)], axis=1)
-            to_map = (frame[:2] @ world) * SHADOW_TEXELS
-            to_map[:, 2] += SHADOW_REACH * SHADOW_TEXELS - 0.5
-            flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-            shades.append(cv2.warpAffine(shade, to_map, (width, height), flags=flags))
-        key = (self.key * self.frame[2, 2]).astype(np.float32)
-        lit = (1 - shades[0])[..., None] * key + (1 - 0.5 * shades[1])[..., None] * self.sky.astype(np.float32)
-        return np.clip(panel.texture * lit, 0, 255).astype(np.uint8)
-
-
-def _seen_along(frame: Floats, vertices: Floats, faces: NDArray[np.int64]) -> NDArray[np.float32]:
-    """Largest coordinate along frame[2] at each texel of an orthographic map, -inf where there is nothing."""
-    size = int(2 * SHADOW_REACH * SHADOW_TEXELS)
-    local = vertices @ frame.T
-    xy = (local[:, :2] + SHADOW_REACH) * SHADOW_TEXELS
-    lift = 2 * SHADOW_REACH  # makes all positive, as the depth buffer wants
-    nearness = np.where(np.isfinite(local[:, 2]), local[:, 2] + lift, -1)
-    seen = rasterise(np.nan_to_num(xy), nearness, faces, size, size, cull=False)
-    return np.where(seen.face >= 0, seen.nearness - lift, -np.inf).astype(np.float32)
-
-
-def _room(rng: np.random.Generator, light: _Light, vertices: Floats, faces: NDArray[np.int64]) -> tuple[Panel, ...]:
-    """Floor, walls and the mat under the object, with light and shadows."""
-    x, y, z = np.eye(3)
-    corners = (np.arange(ROOM_WALLS) + 0.5) * 2 * np.pi / ROOM_WALLS
-    outer = ROOM_RADIUS / np.cos(np.pi / ROOM_WALLS)
-    ring = np.stack([outer * np.cos(corners), outer * np.sin(corners), np.zeros(ROOM_WALLS)], axis=1)
-
-    def ground(half: float, texels: int, step: int, style: str, outline: Floats) -> Panel:
-        side = int(2 * half * texels)
-        bare = Panel(
-            np.array([-half, -half, 0]), x / texels, y / texels, outline, painted_plane(rng, side, side, step, style)
-        )
-        return Panel(bare.origin, bare.right, bare.down, outline, light.on_ground(bare, vertices, faces))
-
-    panels = [ground(outer, 130, 50, str(rng.choice(["tiles", "boards"])), ring)]
-    texels, tall = 120, 3.4
-    for first, second in zip(ring, np.roll(ring, -1, axis=0), strict=True):
-        width = float(np.linalg.norm(second - first))
-        picture = painted_plane(rng, int(tall * texels), int(width * texels), 90, "paper")
-        shade = rng.uniform(0.7, 1.0)
-        right = (second - first) / width / texels
-        outline = np.array([first, second, second + 12 * z, first + 12 * z])
-        panels.append(Panel(first + tall * z, right, -z / texels, outline, (picture * shade).astype(np.uint8)))
-    half = 1.75
-    mat = np.array([[-half, -half, 0], [half, -half, 0], [half, half, 0], [-half, half, 0]])
-    panels.append(ground(half, 380, int(rng.integers(60, 120)), str(rng.choice(["shapes", "tiles", "boards"])), mat))
-    return tuple(panels)

@@ -271,12 +271,12 @@ def car(rng: np.random.Generator) -> list[Part]:
 
 
 def plane(rng: np.random.Generator) -> list[Part]:
-    length, r, z = 2.0, rng.uniform(0.24, 0.34), 0.75
+    length, r, z = 1.9, rng.uniform(0.33, 0.45), 0.8
     hull = [(-1, 0.12), (-0.9, 0.3), (-0.4, 0.85), (0.2, 1), (0.7, 0.92), (0.93, 0.6), (1, 0.2)]
     body = [(f * length, 0, r * k, z + 0.12 * (1 - k) * (f < 0), r * k) for f, k in hull]
     span, chord, sweep_back, dihedral = (
-        rng.uniform(1.5, 2.2),
-        rng.uniform(0.35, 0.5),
+        rng.uniform(1.5, 2.1),
+        rng.uniform(0.5, 0.72),
         rng.uniform(0, 0.6),
         rng.uniform(0, 0.2),
     )
@@ -290,7 +290,7 @@ def plane(rng: np.random.Generator) -> list[Part]:
             -(at - sweep_back * side * reach / span),
             size * (1 - 0.5 * side),
             height + dihedral * side,
-            0.09 * (1 - 0.4 * side),
+            0.11 * (1 - 0.4 * side),
         ]
         return loft(np.stack(rows, axis=1), axis=1)
 
@@ -315,11 +315,11 @@ def plane(rng: np.random.Generator) -> list[Part]:
 
 def hammer(rng: np.random.Generator) -> list[Part]:
     """Standing on its head, as one leaves it on a bench."""
-    length, thin = rng.uniform(2.4, 3.4), rng.uniform(0.17, 0.24)
+    length, thin = rng.uniform(2.2, 3.0), rng.uniform(0.23, 0.31)
     swell = np.array([1.0, 0.85, 0.8, 1.0, 1.25, 1.2])
     up = spline(np.stack([np.zeros(6), np.zeros(6), np.linspace(0.3, length, 6)], axis=1), 30)
     radii = thin * np.interp(np.linspace(0, 1, 30), np.linspace(0, 1, 6), swell)
-    half, r = rng.uniform(0.75, 1.1), rng.uniform(0.32, 0.45)
+    half, r = rng.uniform(0.85, 1.2), rng.uniform(0.42, 0.56)
     face = loft(
         [
             (0, 0, r * 0.8, r, r * 0.8),

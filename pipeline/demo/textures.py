@@ -166,9 +166,9 @@ class SolidTexture:
 def random_texture(rng: np.random.Generator, part: str | None = None) -> SolidTexture:
     """A texture for one part of one instance: the part name gives the hue, chance gives the rest (any hue for None)."""
     hue = PART_HUES[part] + rng.normal(0, 0.018) if part else rng.random()
-    saturation, value = rng.uniform(0.55, 0.85), rng.uniform(0.62, 0.9)
+    saturation, value = rng.uniform(0.5, 0.8), rng.uniform(0.75, 1.0)
     palette = [
-        hsv_to_rgb(hue + rng.normal(0, 0.02), saturation, value * 0.42),
+        hsv_to_rgb(hue + rng.normal(0, 0.02), saturation, value * 0.45),
         hsv_to_rgb(hue + rng.normal(0, 0.015), saturation, value * 0.8),
         hsv_to_rgb(hue, saturation, value),
         hsv_to_rgb(hue + rng.normal(0, 0.025), saturation * 0.4, min(1.0, value * 1.25)),
@@ -209,7 +209,7 @@ def painted_plane(rng: np.random.Generator, height: int, width: int, step: int, 
         step: pixels of the style's typical feature (a tile, a board, a shape).
         style: "tiles", "boards", "shapes" or "paper".
     """
-    hue, saturation, value = rng.random(), rng.uniform(0.15, 0.45), rng.uniform(0.5, 0.75)
+    hue, saturation, value = rng.random(), rng.uniform(0.08, 0.3), rng.uniform(0.5, 0.75)
     image = np.empty((height, width, 3), np.float32)
     image[:] = 255 * hsv_to_rgb(hue, saturation, value)
     if style == "tiles":
