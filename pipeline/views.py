@@ -57,7 +57,7 @@ class ViewsConfig:
     size: int = 224
     """Side of the square views in pixels."""
     margin: float = 0.1
-    """Room around the object's bounding box, as a share of its longer side, on each side."""
+    """Room around the object's bounding box, as a share of its longer side, on each side; less at the image's edge."""
     min_object_px: int = 24
     """Frames whose object is smaller than this (longer side, in the stored image) are left out."""
     jpeg_quality: int = 95
@@ -160,13 +160,20 @@ def object_extent(mask: NDArray[np.bool_]) -> NDArray[np.floating] | None:
 def crop_camera(camera: Camera, extent: NDArray[np.floating], size: int, margin: float) -> Camera:
     """The pinhole camera of the square around the object: same centre, rotation and aspect as `camera`.
 
+    The square has the object in its middle, or is shifted to stay within the image where it can.
+
     Args:
         extent: (N, 2) pixels of the object's outline in the stored image.
     """
     outline = camera.to_normalised(extent) * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]  # undistorted pixels
     low, high = outline.min(axis=0) - 0.5, outline.max(axis=0) + 0.5
-    side = float((high - low).max()) * (1 + 2 * margin)
-    corner = (low + high - side) / 2
+    image = np.array([camera.width, camera.height], dtype=np.float64)
+    object_side = float((high - low).max())
+    # the margin gives way where the image ends: what lies beyond would only be a repeated border
+    side = max(object_side, min(object_side * (1 + 2 * margin), float(image.min())))
+    centred = (low + high - side) / 2
+    shifted = np.clip(np.clip(centred, 0, np.maximum(0, image - side)), high - side, low)
+    corner = np.where(side <= image, shifted, centred)
     K = np.diag([size / side, size / side, 1.0]) @ np.array([[1, 0, -corner[0]], [0, 1, -corner[1]], [0, 0, 1.0]])
     return Camera(size, size, K @ camera.K, np.zeros(4), camera.R, camera.t)
 

@@ -1,6 +1,7 @@
 """Views: exact cameras, no aliasing, no invented depth, and clear words where there can be none."""
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from synthetic import OBJECT, Scene, orbit, pixel_centres, write_sequence
 
 from dope.common.errors import BadInput
 from pipeline.depth_sampling import DepthSampler
+from pipeline.geometry import Camera
 from pipeline.sequence import Frame, Sequence, write_image
 from pipeline.views import (
     View,
@@ -118,13 +120,33 @@ def test_the_square_holds_the_object_with_its_margin(views: list[View]) -> None:
         assert -size < x < 320 and -size < y < 240
 
 
-def test_an_object_at_the_border_says_how_much_is_inside(tmp_path: Path) -> None:
-    cameras = [type(c)(c.width, c.height, c.K + np.array([[0, 0, 120], [0, 0, 0], [0, 0, 0]]), c.distortion, c.R, c.t)
-               for c in orbit(1, wobble=0.0)]  # fmt: skip
-    view = next(build_views(write_sequence(tmp_path / "edge", cameras, Scene()), ALL))
-    assert 0.3 < view.inside_share < 0.95
-    assert not view.mask[:, -2:].any()
-    assert view.depth is not None and not view.depth[:, -2:].any()
+def moved(camera: Camera, dx: float, dy: float, height: int = 240) -> Camera:
+    """The same camera with its image shifted, and maybe cut."""
+    return replace(camera, height=height, K=camera.K + np.array([[0, 0, dx], [0, 0, dy], [0, 0, 0]]))
+
+
+def test_the_square_stays_inside_the_image_where_it_can(tmp_path: Path) -> None:
+    camera = moved(orbit(1, wobble=0.0)[0], 75, 0)
+    sequence = write_sequence(tmp_path / "edge", [camera], Scene())
+    view = next(build_views(sequence, ALL))
+    rows, columns = np.nonzero(view.mask)
+    assert view.inside_share == 1
+    assert 224 / 1.2 - 6 < np.ptp(columns) < 224 and columns.max() > 210 > rows.max()
+    np.testing.assert_allclose(rows.mean(), 112, atol=6)
+
+
+def test_what_the_image_does_not_cover_is_known(tmp_path: Path) -> None:
+    """A ball wider than the image is high: the square reaches beyond, and nothing is claimed of what is there."""
+    camera = moved(orbit(1, wobble=0.0)[0], 0, -70, height=100)
+    view = next(build_views(write_sequence(tmp_path / "strip", [camera], Scene()), ALL))
+    side = view.crop[2]
+    assert side > 140
+    assert view.inside_share == pytest.approx(100 / side, abs=0.02)
+    assert view.depth is not None
+    for name, values in (("mask", view.mask), ("depth", view.depth)):
+        covered = np.flatnonzero(values.any(axis=1))
+        assert np.ptp(covered) + 1 == pytest.approx(224 * 100 / side, abs=2), name
+        assert covered.mean() == pytest.approx(112, abs=2), name
 
 
 def test_specks_do_not_widen_the_crop() -> None:
