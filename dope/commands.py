@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 
@@ -77,6 +77,12 @@ def evaluate(
     classes: Annotated[
         str, typer.Option(help="category: of unseen objects; instance: which object, from other views of it.")
     ] = "category",
+    shot_mode: Annotated[
+        str, typer.Option(help="Shots of a category: several_instances, or one_instance seen from several sides.")
+    ] = "several_instances",
+    categories: Annotated[
+        list[str] | None, typer.Option("--category", help="Only these; repeatable.", show_default=False)
+    ] = None,
     classifier: Annotated[str, typer.Option(help="local: local matching, as in the paper; centroid.")] = "local",
     split: Annotated[str, typer.Option(help="Views of the shards: all, train or val.")] = "all",
     fit: Annotated[bool, typer.Option("--fit", help="Fewer ways or queries where the views do not suffice.")] = False,
@@ -84,6 +90,7 @@ def evaluate(
         bool, typer.Option("--compare-untrained", help="The same episodes with random weights, too.")
     ] = False,
     seed: Annotated[int, typer.Option(help="Seed of the episodes.")] = 0,
+    memory_gb: Annotated[float, typer.Option(help="Descriptors kept in memory; beyond it, encoded again.")] = 4.0,
     device: Device = "auto",
 ) -> None:
     """Low-shot recognition: accuracy over random episodes with its 95% confidence interval, beside chance.
@@ -108,6 +115,7 @@ def evaluate(
 
     episode: dict[str, Any] = {
         "queries": queries, "episodes": episodes, "seed": seed, "classes": classes, "fit": fit,
+        "shot_mode": shot_mode,
     }  # fmt: skip
     protocols = tuple(
         settings.from_mapping(EpisodeConfig, {**episode, "ways": way, "shots": shot}, where="dope eval")
@@ -115,6 +123,7 @@ def evaluate(
         for shot in shots or [1]
     )
     values: dict[str, Any] = {"classifier": classifier, "split": split, "compare_untrained": compare_untrained}
+    values |= {"categories": tuple(categories or ()), "memory_gb": memory_gb}
     config = settings.from_mapping(EvaluationConfig, {**values, "protocols": protocols}, where="dope eval")
     checkpoint = find_checkpoint(run)
     with progress_bar() as progress:
@@ -141,6 +150,14 @@ def figure(
     ] = None,
     views: Annotated[int, typer.Option(help="Views of an object.")] = 6,
     limit: Annotated[int, typer.Option(help="Objects, where none is named.")] = 3,
+    masks: Annotated[str, typer.Option(help="predicted by the network, or given in the shards.")] = "predicted",
+    colours: Annotated[
+        str, typer.Option(help="colouring: by position, or pca: by the descriptors' principal components.")
+    ] = "position",
+    point: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="heatmap: x y in pixels of the first view.  [default: the object's middle]"),
+    ] = None,
     device: Device = "auto",
 ) -> None:
     """Pictures of what a checkpoint has learnt, as PNG files.
@@ -155,11 +172,12 @@ def figure(
     from dope.checkpoints import find_checkpoint
     from dope.figures import draw_figures
 
-    chosen = _choice(kind, "--kind", ("colouring", "heatmap"))
-    for path in draw_figures(
-        find_checkpoint(run), shards, out, kind=chosen, sequences=sequence, views=views, limit=limit,
-        device=_device(device),
-    ):  # fmt: skip
+    _check_choice(kind, "--kind", ("colouring", "heatmap"))
+    _check_choice(masks, "--masks", ("predicted", "given"))
+    _check_choice(colours, "--colours", ("position", "pca"))
+    options: dict[str, Any] = {"kind": kind, "masks": masks, "colours": colours, "point": point}
+    options |= {"sequences": sequence, "views": views, "limit": limit, "device": _device(device)}
+    for path in draw_figures(find_checkpoint(run), shards, out, **options):
         typer.echo(path)
 
 
@@ -192,7 +210,6 @@ def _device(name: str) -> str:
     return name
 
 
-def _choice(value: str, flag: str, choices: tuple[str, ...]) -> Literal["colouring", "heatmap"]:
+def _check_choice(value: str, flag: str, choices: tuple[str, ...]) -> None:
     if value not in choices:
         raise UsageError(f"'{value}' is not one of {', '.join(choices)}", where=flag)
-    return value  # type: ignore[return-value]

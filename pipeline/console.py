@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
@@ -112,10 +113,25 @@ def exit_code(rows: list[StageResult]) -> int:
     return 0 if all(row.ok for row in rows) else 1
 
 
-def show_details(details: dict[str, Any]) -> None:
-    """Print a short mapping of figures, one a line."""
+def show_shards(out: Path, details: dict[str, Any], *, as_json: bool) -> None:
+    """Print what `write_shards` returned; sequences that were left out come last, with their reasons."""
+    if as_json:
+        sys.stdout.write(json.dumps({"out": str(out), **details}, ensure_ascii=False) + "\n")
+        return
     console = Console(highlight=False)
-    for key, value in details.items():
-        if isinstance(value, (dict, list)):
-            value = json.dumps(value, ensure_ascii=False)
-        console.print(f"  {key.replace('_', ' ')}: {escape(str(value))}", soft_wrap=True)
+    done = " (done before)" if details.get("skipped") else ""
+    pairs, views = details["pairs"], details["views"]
+    console.print(
+        f"[bold]{escape(str(out))}[/]: {pairs['train']} training pairs, {pairs['val']} held-out pairs, "
+        f"{sum(views.values())} views of {details['sequences']} sequences{done}",
+        soft_wrap=True,
+    )
+    if details.get("waiting_for"):
+        console.print(f"  {details['waiting_for']} tars are still to be written by the other parts of this array job")
+    if details["without_val_pairs"]:
+        names = ", ".join(details["without_val_pairs"])
+        console.print(f"  nothing could be held out of {escape(names)}", soft_wrap=True)
+    if "verified" in details:
+        console.print(f"  verified: {details['verified']['bytes']:,} bytes in {details['verified']['shards']} tars")
+    for sequence, reason in details["left_out"].items():
+        console.print(f"  [yellow]left out[/] {escape(sequence)}: {escape(reason)}", soft_wrap=True)
