@@ -20,6 +20,7 @@ from dope.common import files
 from dope.common.errors import BadInput
 from pipeline.photos import PHOTO_SUFFIXES, UNSUPPORTED_PHOTOS, list_photos, natural_order
 from pipeline.sequence import sequence_id
+from pipeline.stages import StageResult
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"})
 NOT_PHOTOS = frozenset({"mask", "masks", "depth", "depths", "segmentation", "segmentations"})
@@ -101,6 +102,11 @@ def find_sources(
             remedy = "--masks is a folder: for several inputs it holds a folder for each id; {} stands for the input"
             errors.append((source.id, source.path, BadInput("no such folder of masks", where=folder, remedy=remedy)))
     return kept, errors
+
+
+def input_errors_as_rows(errors: Iterable[SourceError]) -> list[StageResult]:
+    """Inputs that cannot be used, as failed rows of the first stage."""
+    return [StageResult(name, "frames", "failed", reason=str(error)) for name, _path, error in errors]
 
 
 def source_fingerprint(source: Source) -> dict[str, Any]:

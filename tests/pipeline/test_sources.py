@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from tiny_media import encode, pan, texture, write_photos
 
-from pipeline.sources import find_sources, source_fingerprint
+from pipeline.sources import find_sources, input_errors_as_rows, source_fingerprint
 
 PHOTO = encode(texture(16, 16))
 
@@ -75,7 +75,9 @@ def test_bad_inputs_are_rows_and_the_others_go_on(tmp_path: Path) -> None:
     sources, errors = find_sources([*inputs, touch(tmp_path / "notes.txt")])
     assert [s.id for s in sources] == ["good"]
     assert [path for _, path, _ in errors] == [*inputs[:4], tmp_path / "notes.txt"]
-    texts = [str(error) for *_, error in errors]
+    rows = input_errors_as_rows(errors)
+    assert [(row.sequence, row.status) for row in rows][1:3] == [("empty", "failed"), ("text", "failed")]
+    texts = [str(row.reason) for row in rows]
     wanted = ["no such file", "empty folder", "holds neither", "Convert .heic", "neither a video nor"]
     for text, part in zip(texts, wanted, strict=True):
         assert part in text and str(tmp_path) in text
