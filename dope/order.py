@@ -94,10 +94,7 @@ class SampleOrder:
                 remedy=f"Use --set data.batch_size={max(1, self.batch_size // world) * world}",
             )
         share = self.batch_size // world
-        for epoch in range(start.epoch, epochs):
-            first = start.consumed // self.batch_size if epoch == start.epoch else 0
-            for batch in self.epoch(epoch)[first:]:
-                yield batch[rank * share : (rank + 1) * share].tolist()
+        return self._shares(start, epochs, slice(rank * share, (rank + 1) * share))
 
     def after(self, place: Place) -> Place:
         """The place one step later."""
@@ -105,6 +102,12 @@ class SampleOrder:
         if consumed >= self.steps_per_epoch * self.batch_size:
             return Place(place.epoch + 1, 0)
         return Place(place.epoch, consumed)
+
+    def _shares(self, start: Place, epochs: int, mine: slice) -> Iterator[list[int]]:
+        for epoch in range(start.epoch, epochs):
+            first = start.consumed // self.batch_size if epoch == start.epoch else 0
+            for batch in self.epoch(epoch)[first:]:
+                yield batch[mine].tolist()
 
     def _pair_of_round(self, number: int) -> NDArray[np.int64]:
         """(n_objects,) the sample row that each object shows in round `number`."""

@@ -61,6 +61,7 @@ def train(
         found = checkpoint_to_resume(out, resume)
         if found is not None:
             checkpoints.resume(found, state, config, dataset.index.fingerprint)
+        rows = order.batches(state.place, config.schedule.epochs, rank=ranks.rank, world=ranks.world)
         online = wrap(state.network, ranks)
         begun, first_step = time.perf_counter(), state.step
         total = config.schedule.epochs * order.steps_per_epoch
@@ -73,7 +74,6 @@ def train(
             log.event("start", state.step, state.place.epoch, {**start, "resumed_from": found and str(found)})
             if state.step == 0:
                 state.untrained = state.validation = validate(state, held_out, config, ranks, log)
-            rows = order.batches(state.place, config.schedule.epochs, rank=ranks.rank, world=ranks.world)
             meter, stopping = Meter(), state.step >= last_step
             loader = PairLoader(dataset, rows, workers=config.data.workers, pin_memory=ranks.device.type == "cuda")
             for batch in loader if not stopping else ():

@@ -103,6 +103,8 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
     if origin in (typing.Union, types.UnionType):
         return _convert_union(hint, value, where)
     if origin is typing.Literal:
+        if isinstance(value, bool) and {"on", "off"} & set(typing.get_args(hint)):
+            value = "on" if value else "off"  # YAML 1.1 reads a bare on or off as a boolean
         if value not in typing.get_args(hint):
             choices = ", ".join(map(str, typing.get_args(hint)))
             raise UsageError(f"'{value}' is not one of {choices}", where=where)

@@ -30,7 +30,7 @@ def test_pairs_of_an_object_are_not_repeated_before_all_were_shown() -> None:
     shown = [int(row) for epoch in range(12) for row in order.epoch(epoch).ravel()]
     for number in np.unique(OBJECTS):
         own = [row for row in shown if OBJECTS[row] == number]
-        n_pairs = int((OBJECTS == number).sum())
+        n_pairs = int(np.count_nonzero(number == OBJECTS))
         for cycle in range(12 // n_pairs):
             assert len(set(own[cycle * n_pairs : (cycle + 1) * n_pairs])) == n_pairs
 
@@ -89,7 +89,7 @@ def test_several_pairs_an_object_make_up_for_few_objects(caplog: pytest.LogCaptu
 
 def test_a_batch_that_ranks_cannot_share_is_an_error() -> None:
     with pytest.raises(UsageError, match=r"data\.batch_size=3"):
-        next(SampleOrder(OBJECTS, 5).batches(Place(), 1, world=3))
+        SampleOrder(OBJECTS, 5).batches(Place(), 1, world=3)
 
 
 def test_large_orders_are_fast() -> None:

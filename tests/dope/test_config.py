@@ -1,0 +1,78 @@
+from pathlib import Path
+
+import pytest
+
+from dope.common.errors import UsageError
+from dope.common.settings import to_dict
+from dope.config import TrainConfig, differing_keys, load_config, preset_names
+
+
+def test_the_defaults_and_the_paper_preset_are_the_papers() -> None:
+    config = load_config("paper")
+    assert config == TrainConfig()
+    assert (config.data.image_size, config.data.batch_size, config.data.points) == (224, 256, 32)
+    assert config.network.projector == (1024, 1024, 1024, 256)
+    assert (config.loss.temperature, config.loss.negatives, config.loss.mask_weight) == (0.1, "both", 1.0)
+    assert (config.optimiser.lr, config.optimiser.weight_decay) == (1e-4, 1e-2)
+    assert (config.schedule.epochs, config.schedule.per, config.schedule.warmup_steps) == (3000, "epoch", 0)
+    assert (config.momentum, config.seed, config.pairs) == (0.999, 12345, "two_views")
+
+
+def test_every_preset_resolves() -> None:
+    assert preset_names() == ["nano", "paper"]
+    for name in preset_names():
+        load_config(name)
+
+
+def test_a_file_goes_over_the_preset_and_overrides_over_both(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("optimiser: {lr: 2e-4}\ndata: {batch_size: 64}\n")
+    config = load_config("nano", path, ["data.batch_size=32", "loss.negatives=second_view"])
+    assert config.optimiser.lr == 2e-4
+    assert config.data.batch_size == 32
+    assert config.data.image_size == load_config("nano").data.image_size
+    assert config.loss.negatives == "second_view"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["data.bach_size=4"], "did you mean 'batch_size'"),
+        (["optimizer.lr=1"], "did you mean 'optimiser'"),
+        (["loss.negatives=all"], "not one of both, other_objects, second_view"),
+        (["data.batch_size=many"], "not of type int"),
+        (["data.batch_size"], "not key=value"),
+        (["data.image_size=100"], "data.image_size: '100' must be a positive multiple of 32"),
+        (["data.batch_size=1"], "data.batch_size: '1' must be at least 2"),
+        (["loss.temperature=0"], "must be positive"),
+        (["momentum=1.5"], r"must lie in \[0, 1\]"),
+        (["data.max_points=3"], "must not be less than data.points"),
+    ],
+)
+def test_wrong_settings_are_named(overrides: list[str], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        load_config("paper", None, overrides)
+
+
+def test_a_bare_off_is_a_word_where_a_word_is_wanted() -> None:
+    config = load_config("paper", None, ["augmentation.background_removal=off", "network.predict_mask=off"])
+    assert config.augmentation.background_removal == "off"
+    assert config.network.predict_mask is False
+
+
+def test_an_unknown_preset_names_the_closest() -> None:
+    with pytest.raises(UsageError, match="did you mean 'nano'"):
+        load_config("nan0")
+
+
+def test_an_unknown_key_in_a_file_names_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("schedule: {epoch: 3}\n")
+    with pytest.raises(UsageError, match=r"mine\.yaml: schedule: unknown key 'epoch' \(did you mean 'epochs'"):
+        load_config(None, path)
+
+
+def test_only_what_changes_the_result_counts_as_a_difference() -> None:
+    ours = to_dict(load_config("paper", None, ["data.workers=1", "device=cpu", "checkpoint.keep=3", "momentum=0.9"]))
+    assert differing_keys(ours, to_dict(TrainConfig())) == {"momentum": (0.9, 0.999)}
+    assert differing_keys({"betas": (0.9, 0.99)}, {"betas": [0.9, 0.99]}) == {}

@@ -1,0 +1,319 @@
+import json
+import math
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from tiny_shards import write_shards
+
+from dope import trainer
+from dope.augmentation import no_augmentation
+from dope.batch import PairBatch
+from dope.checkpoints import list_checkpoints, load_network
+from dope.common.errors import BadInput, DopeError, UsageError
+from dope.config import TrainConfig, load_config
+from dope.distributed import Ranks
+from dope.run_logging import read_metrics
+from dope.state import TrainState, learning_rate, new_state, wrap
+from dope.step import StepLosses, choose_cells, compute_losses, sample_batch
+from dope.streaming import PairDataset, collate
+from dope.trainer import train
+
+ALONE = Ranks(0, 1, torch.device("cpu"))
+TINY = [
+    "network.width=0.125", "network.pyramid=16", "network.projector=[16, 8]", "data.image_size=32", "data.points=8",
+    "data.batch_size=4", "data.pairs_per_object=1", "data.workers=0", "schedule.epochs=3", "validation.every=1",
+    "checkpoint.every=0", "log_every=1", "device=cpu",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_shards(tmp_path_factory.mktemp("shards"), n_objects=8, pairs=3, val_objects=3, size=32, n_points=60)
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> None:
+    torch.set_num_threads(1)
+
+
+def tiny(*overrides: str) -> TrainConfig:
+    return load_config("nano", None, [*TINY, *overrides])
+
+
+def losses_of(run: Path) -> list[float]:
+    return [line["loss"] for line in read_metrics(run, "step")]
+
+
+def test_a_run_leaves_all_that_it_promises(shards: Path, tmp_path: Path) -> None:
+    result = train(shards, tmp_path / "run", tiny("checkpoint.every=1", "checkpoint.keep=2"))
+    assert (result["status"], result["step"], result["epoch"]) == ("finished", 6, 3)
+    run = tmp_path / "run"
+    assert [path.name for path in list_checkpoints(run)] == ["step-00000004.pt", "step-00000006.pt"]
+    assert result["checkpoint"] == str(list_checkpoints(run)[-1])
+    assert [line["step"] for line in read_metrics(run, "step")] == [1, 2, 3, 4, 5, 6]
+    validations = read_metrics(run, "validation")
+    assert [line["step"] for line in validations] == [0, 2, 4, 6]  # the untrained network first
+    assert validations[0]["pck"] == result["pck_untrained"] and validations[-1]["pck"] == result["pck"]
+    assert validations[0]["pairs"] == 6 and validations[0]["points"] <= 48
+    assert list((run / "tensorboard").iterdir())
+    text = (run / "config.yaml").read_text()
+    assert load_config(None, run / "config.yaml") == tiny("checkpoint.every=1", "checkpoint.keep=2")
+    assert text.startswith("# hash ") and yaml.safe_load(text)["seed"] == 12345
+    assert load_network(run)[1]["step"] == 6
+
+
+def test_stopping_and_going_on_is_bitwise_the_same(shards: Path, tmp_path: Path) -> None:
+    config = tiny("validation.every=0")
+    whole = train(shards, tmp_path / "whole", config)
+    first = train(shards, tmp_path / "parts", config, stop_after=3)
+    assert (first["status"], first["step"], first["epoch"]) == ("stopped", 3, 1)
+    # settings that do not change the result may differ
+    second = train(shards, tmp_path / "parts", replace(config, data=replace(config.data, workers=1)))
+    assert second["status"] == "finished" and whole["loss"] == second["loss"]
+    assert losses_of(tmp_path / "whole") == losses_of(tmp_path / "parts")
+    ours, theirs = (load_network(tmp_path / name)[0].state_dict() for name in ("whole", "parts"))
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+
+
+def test_another_seed_gives_another_run(shards: Path, tmp_path: Path) -> None:
+    for seed in (1, 2):
+        train(shards, tmp_path / str(seed), tiny(f"seed={seed}", "schedule.epochs=1", "validation.every=0"))
+    assert losses_of(tmp_path / "1") != losses_of(tmp_path / "2")
+
+
+def test_lines_after_the_checkpoint_are_forgotten_when_a_killed_run_goes_on(shards: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    train(shards, run, tiny("validation.every=0"), stop_after=2)
+    with (run / "metrics.jsonl").open("a") as file:  # as a run killed between two checkpoints leaves it
+        file.write(json.dumps({"event": "step", "step": 3, "epoch": 1, "loss": -1.0}) + '\n{"event": "st')
+    train(shards, run, tiny("validation.every=0"))
+    lines = read_metrics(run, "step")
+    assert [line["step"] for line in lines] == [1, 2, 3, 4, 5, 6]
+    assert all(line["loss"] > 0 for line in lines)
+
+
+def test_a_finished_run_has_nothing_to_do(shards: Path, tmp_path: Path) -> None:
+    train(shards, tmp_path, tiny("schedule.epochs=1"))
+    again = train(shards, tmp_path, tiny("schedule.epochs=1"))
+    assert again["status"] == "finished" and again["steps_of_this_call"] == 0 and again["pck"] is not None
+
+
+def test_resume_never_insists_on_a_new_folder(shards: Path, tmp_path: Path) -> None:
+    train(shards, tmp_path, tiny("schedule.epochs=1", "validation.every=0"))
+    with pytest.raises(UsageError, match=r"already holds a run .*--out"):
+        train(shards, tmp_path, tiny(), resume="never")
+
+
+def test_resuming_with_other_settings_names_them(shards: Path, tmp_path: Path) -> None:
+    train(shards, tmp_path, tiny("validation.every=0"), stop_after=1)
+    with pytest.raises(UsageError, match=r"optimiser\.lr is 0\.5, was 0\.001"):
+        train(shards, tmp_path, tiny("optimiser.lr=0.5"))
+
+
+def test_resume_from_a_given_checkpoint_of_another_folder(shards: Path, tmp_path: Path) -> None:
+    config = tiny("validation.every=0")
+    train(shards, tmp_path / "a", config, stop_after=2)
+    result = train(shards, tmp_path / "b", config, resume=str(list_checkpoints(tmp_path / "a")[0]))
+    assert result["steps_of_this_call"] == 4
+    with pytest.raises(BadInput, match="no such file"):
+        train(shards, tmp_path / "c", config, resume=tmp_path / "none.pt")
+
+
+def test_without_held_out_pairs_nothing_is_validated(tmp_path: Path) -> None:
+    shards = write_shards(tmp_path / "shards", n_objects=4, pairs=1, size=32)
+    result = train(shards, tmp_path / "run", tiny("schedule.epochs=1"))
+    assert result["pck"] is None and read_metrics(tmp_path / "run", "validation") == []
+
+
+def test_too_few_objects_for_a_batch_name_the_setting(shards: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"data\.batch_size"):
+        train(shards, tmp_path, tiny("data.batch_size=64"))
+
+
+def test_damaged_shards_stop_before_the_first_step(shards: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(shards, tmp_path / "copy"))
+    os.truncate(copy / "train-000001.tar", 3000)
+    with pytest.raises(BadInput, match=r"train-000001\.tar: is cut off"):
+        train(copy, tmp_path / "run", tiny())
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_loss_that_is_not_finite_stops_with_step_and_samples(
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = trainer.sample_batch
+
+    def poisoned(batch: object, config: TrainConfig, step: int, rank: int) -> object:
+        sampled = real(batch, config, step, rank)  # type: ignore[arg-type]
+        if step == 2:
+            sampled.views.images1[0, 0, 0, 0] = float("nan")
+        return sampled
+
+    monkeypatch.setattr(trainer, "sample_batch", poisoned)
+    with pytest.raises(DopeError, match=r"the loss is nan at step 2 .*object_00\d-000\d") as caught:
+        train(shards, tmp_path, tiny("validation.every=0"))
+    assert "optimiser.lr" in str(caught.value)
+    line = read_metrics(tmp_path, "not_finite")[0]
+    assert line["step"] == 2 and len(line["keys"]) == 4
+
+
+@pytest.mark.parametrize("pairs", ["two_views", "one_view_twice"])
+@pytest.mark.parametrize("negatives", ["both", "other_objects", "second_view"])
+@pytest.mark.parametrize("predict_mask", [True, False])
+def test_every_ablation_trains(shards: Path, pairs: str, negatives: str, predict_mask: bool) -> None:
+    config = tiny(f"pairs={pairs}", f"loss.negatives={negatives}", f"network.predict_mask={predict_mask}".lower())
+    state, losses = one_step(shards, config)
+    losses.backward.backward()
+    gradients = [p.grad for p in state.network.parameters()]
+    assert all(g is not None and torch.isfinite(g).all() for g in gradients)
+    assert sum(float(g.abs().sum()) for g in gradients if g is not None) > 0
+    assert (losses.report["mask"] > 0) == predict_mask
+
+
+def test_pairs_without_valid_points_do_no_harm(shards: Path) -> None:
+    config = tiny()
+    batch = batch_of(shards, config)
+    half, none = batch.valid.clone(), torch.zeros_like(batch.valid)
+    half[0] = False
+    for valid, points in ((half, 24), (none, 0)):
+        state = new_state(config, ALONE)
+        sampled = choose_cells(no_augmentation(replace(batch, valid=valid)), config.data.points, torch.Generator())
+        losses = compute_losses(wrap(state.network, ALONE), state.momentum, sampled, config, ALONE)
+        losses.backward.backward()
+        assert losses.report["points"] == points and math.isfinite(losses.report["loss"])
+        assert all(p.grad is None or bool(torch.isfinite(p.grad).all()) for p in state.network.parameters())
+
+
+def test_the_loss_is_the_mean_over_points_by_a_naive_loop(shards: Path) -> None:
+    config = tiny()
+    state, batch = new_state(config, ALONE), batch_of(shards, config)
+    batch.valid[1, 3:] = False  # three points only
+    sampled = choose_cells(no_augmentation(batch), config.data.points, torch.Generator().manual_seed(0))
+    report = compute_losses(wrap(state.network, ALONE), state.momentum, sampled, config, ALONE).report
+    first = state.network(sampled.views.images1)
+    queries = state.network.sample(first, sampled.cells1)
+    keys = state.momentum.sample(state.momentum(sampled.views.images2), sampled.cells2)
+    losses = []
+    for b in range(4):
+        for p in torch.nonzero(sampled.ok[b]).flatten().tolist():
+            logits = torch.stack([queries[b, p] @ keys[i, j] for i in range(4) for j in range(8) if sampled.ok[i, j]])
+            positive = queries[b, p] @ keys[b, p]
+            losses.append((logits / 0.1).logsumexp(0) - positive / 0.1)
+    assert report["points"] == 27
+    assert report["contrastive"] == pytest.approx(torch.stack(losses).mean().item(), rel=1e-5)
+    assert report["loss"] == pytest.approx(report["contrastive"] + report["mask"])
+
+
+def test_cells_hold_their_points(shards: Path) -> None:
+    config = tiny()
+    sampled = sample_batch(batch_of(shards, config), config, step=3, rank=0)
+    views = sampled.views
+    for b in range(4):
+        first = {(int(y // 4), int(x // 4)) for x, y, _, _ in views.points[b][views.valid[b]].tolist()}
+        second = {(int(y // 4), int(x // 4)) for _, _, x, y in views.points[b][views.valid[b]].tolist()}
+        assert {tuple(cell) for cell in sampled.cells1[b][sampled.ok[b]].tolist()} <= first
+        assert {tuple(cell) for cell in sampled.cells2[b][sampled.ok[b]].tolist()} <= second
+
+
+def test_either_view_may_be_the_first(shards: Path) -> None:
+    config = tiny("augmentation.colour_p=0", "augmentation.flip_p=0", "augmentation.background_removal=off")
+    batch = batch_of(shards, config)
+    same = [
+        torch.equal(sample_batch(batch, config, step, 0).views.images1[0], batch.images1[0].float() / 255)
+        for step in range(20)
+    ]
+    assert 4 <= sum(same) <= 16
+
+
+def test_random_numbers_depend_on_step_and_rank(shards: Path) -> None:
+    config = tiny()
+    batch = batch_of(shards, config)
+    images = {key: sample_batch(batch, config, *key).views.images1 for key in ((0, 0), (1, 0), (0, 1))}
+    assert torch.equal(images[0, 0], sample_batch(batch, config, 0, 0).views.images1)
+    assert not torch.equal(images[0, 0], images[1, 0]) and not torch.equal(images[0, 0], images[0, 1])
+
+
+def test_the_momentum_encoder_follows_after_the_step(shards: Path, tmp_path: Path) -> None:
+    train(shards, tmp_path, tiny("schedule.epochs=1", "validation.every=0", "momentum=0.0"))
+    values = torch.load(list_checkpoints(tmp_path)[0], weights_only=True)
+    for name, value in values["network"].items():
+        if "running" not in name and "num_batches" not in name:
+            assert torch.allclose(value, values["momentum"][name], atol=1e-7), name
+
+
+def test_learning_rates() -> None:
+    paper = load_config("paper")
+    rates = [learning_rate(paper, step, 10) for step in range(30_000)]
+    assert rates[0] == rates[9] == 1e-4 and rates[10] < rates[9]  # stepped once an epoch
+    assert rates[15_000] == pytest.approx(0.5e-4) and 0 < rates[-1] < 1e-9
+    config = load_config("nano", None, ["schedule.warmup_steps=4", "schedule.epochs=2", "optimiser.lr=1.0"])
+    rates = [learning_rate(config, step, 12) for step in range(24)]
+    assert rates[:4] == pytest.approx([0.2, 0.4, 0.6, 0.8]) and rates[4] == 1.0
+    assert rates[14] == pytest.approx(0.5) and rates[4:] == sorted(rates[4:], reverse=True)
+    constant = load_config("nano", None, ["schedule.shape=constant", "schedule.warmup_steps=0"])
+    assert {learning_rate(constant, step, 12) for step in range(99)} == {constant.optimiser.lr}
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_writes_a_checkpoint_and_exits_with_75(shards: Path, tmp_path: Path, number: int) -> None:
+    arguments = [
+        argument for value in [*TINY, "schedule.epochs=100000", "data.workers=1"] for argument in ("--set", value)
+    ]
+    command = [sys.executable, "-m", "dope.trainer_main", str(shards), "--out", str(tmp_path), "--preset", "nano"]
+    process = subprocess.Popen(
+        [*command, *arguments], stderr=subprocess.PIPE, text=True, start_new_session=True, env=environment()
+    )
+    try:
+        for _ in range(400):
+            if len(read_metrics(tmp_path, "step")) > 2:
+                break
+            time.sleep(0.1)
+        os.killpg(process.pid, number)  # to the loader's workers too, as a batch system does
+        _, errors = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 75, errors
+    assert "Traceback" not in errors
+    steps = [line["step"] for line in read_metrics(tmp_path, "step")]
+    assert [path.name for path in list_checkpoints(tmp_path)] == [f"step-{steps[-1]:08d}.pt"]
+    assert load_network(tmp_path)[1]["step"] == steps[-1]
+
+
+@pytest.mark.timeout(180)
+def test_it_learns(tmp_path: Path) -> None:
+    shards = write_shards(tmp_path / "shards", n_objects=16, pairs=8, val_objects=8, size=64)
+    settings = [
+        "network.width=0.25", "network.pyramid=32", "network.projector=[64, 32]", "data.image_size=64",
+        "data.points=16", "data.batch_size=16", "data.workers=0", "schedule.epochs=15", "validation.every=0",
+        "checkpoint.every=0", "log_every=1", "optimiser.lr=3e-3", "device=cpu", "validation.every=100",
+        "augmentation.colour_p=0.2", "augmentation.geometry=false",
+    ]  # fmt: skip
+    result = train(shards, tmp_path / "run", load_config("nano", None, settings))
+    losses = losses_of(tmp_path / "run")
+    assert sum(losses[-10:]) < 0.85 * sum(losses[:10])
+    assert result["pck"] > 3 * result["pck_untrained"] and result["pck"] > 0.05
+
+
+def batch_of(shards: Path, config: TrainConfig) -> PairBatch:
+    dataset = PairDataset(shards, "train", image_size=config.data.image_size)
+    return collate([dataset[row] for row in range(4)])
+
+
+def one_step(shards: Path, config: TrainConfig) -> tuple[TrainState, StepLosses]:
+    state = new_state(config, ALONE)
+    sampled = sample_batch(batch_of(shards, config), config, step=0, rank=0)
+    return state, compute_losses(wrap(state.network, ALONE), state.momentum, sampled, config, ALONE)
+
+
+def environment() -> dict[str, str]:
+    return {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parents[2])}
