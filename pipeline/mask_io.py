@@ -30,7 +30,7 @@ def read_mask_values(path: Path) -> NDArray[np.float32]:
     except OSError as error:
         raise BadInput(f"cannot be read ({error.strerror})", where=path) from error
     except BadInput as error:
-        raise BadInput(error.what, where=path) from error
+        raise BadInput(error.what, where=path, remedy=error.remedy) from error
     largest = np.iinfo(image.dtype).max if np.issubdtype(image.dtype, np.integer) else 1.0
     if image.ndim == 3:
         alpha = image[..., -1] if image.shape[2] in (2, 4) else None

@@ -13,7 +13,7 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
@@ -28,10 +28,8 @@ from pipeline.sequence import Frame, Sequence
 
 @dataclass(frozen=True)
 class MasksConfig:
-    """Where masks come from and what counts as one."""
+    """What counts as a mask, and how one is made where none is given."""
 
-    source: Literal["folder", "grabcut"] = "folder"
-    """Import masks of other tools ("folder") or cut the object out, guided by the sparse points ("grabcut")."""
     threshold: float = 0.5
     """Object is above this share of the largest value that the mask's type can hold."""
     min_share: float = 0.0005

@@ -17,6 +17,7 @@ from pipeline.frame_quality import shrink
 
 PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
 UNSUPPORTED_PHOTOS = frozenset({".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".gif"})
+PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 
 
 @dataclass(frozen=True)
@@ -57,8 +58,6 @@ def read_photo(path: Path, long_side: int) -> Photo:
     except OSError as error:
         raise BadInput(f"cannot be read ({error.strerror})", where=path) from error
     header = read_jpeg_header(data)
-    if header is not None and not header.complete:
-        raise BadInput("is cut off (a JPEG without its end marker)", where=path, remedy="Copy the file again")
     factor = 1
     if header is not None:
         # The decoder can skip most of the work for photos much larger than wanted. It rounds up the size, so the
@@ -73,7 +72,7 @@ def read_photo(path: Path, long_side: int) -> Photo:
     try:
         image = decode(data, flags[factor])
     except BadInput as error:
-        raise BadInput(error.what, where=path) from error
+        raise BadInput(error.what, where=path, remedy=error.remedy) from error
     height, width = image.shape[:2]
     upright_image = np.asarray(image, dtype=np.uint8)
     resized = shrink(upright_image, long_side)
@@ -83,7 +82,13 @@ def read_photo(path: Path, long_side: int) -> Photo:
 
 
 def decode(data: bytes, flags: int) -> NDArray[Any]:
-    """Decode an image from memory with OpenCV's `flags`. Raises `BadInput` (without a file's name)."""
+    """Decode an image from memory with OpenCV's `flags`. Raises `BadInput` (without a file's name).
+
+    JPEGs and PNGs that are cut off are refused: some versions of the decoders fill the rest with grey or black.
+    """
+    header = read_jpeg_header(data)
+    if (header is not None and not header.complete) or (data.startswith(PNG_MAGIC) and b"IEND" not in data):
+        raise BadInput("is cut off (it has no end marker)", remedy="Copy the file again")
     try:
         image = cv2.imdecode(np.frombuffer(_without_png_profile(data), np.uint8), flags) if data else None
     except cv2.error as error:
@@ -106,7 +111,7 @@ def turn_upright(image: NDArray[Any], orientation: int) -> NDArray[Any]:
 
 def _without_png_profile(data: bytes) -> bytes:
     """Leave out a PNG's colour profile: it changes no value, and libpng prints a line for each it does not like."""
-    if not data.startswith(b"\x89PNG\r\n\x1a\n"):
+    if not data.startswith(PNG_MAGIC):
         return data
     position = 8
     while position + 12 <= len(data):

@@ -135,7 +135,7 @@ def test_masks_of_another_size_are_errors_that_name_both(tmp_path: Path) -> None
         import_masks(sequence, folder, MasksConfig())
     assert all(part in str(caught.value) for part in (str(wrong), "192x100", "192x128"))
     wrong.write_bytes(wrong.read_bytes()[:100])
-    with pytest.raises(BadInput, match=r"IMG_0002\.png: is not an image"):
+    with pytest.raises(BadInput, match=r"IMG_0002\.png: is cut off"):
         import_masks(sequence, folder, MasksConfig())
     assert not sequence.masks.exists() and all(row.mask is None for row in sequence.read_frames())
 

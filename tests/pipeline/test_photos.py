@@ -112,7 +112,9 @@ def test_damaged_photos_are_rows_with_reasons(tmp_path: Path) -> None:
     details, sequence = extract(folder, tmp_path / "out")
     dropped = {row.source_name: str(row.dropped) for row in sequence.read_frames() if row.dropped}
     assert set(dropped) == {cut.name, text.name, empty.name, "IMG_9999.png"}
-    assert "cut off" in dropped[cut.name] and "not an image" in dropped[text.name]
+    assert (
+        "cut off" in dropped[cut.name] and "cut off" in dropped["IMG_9999.png"] and "not an image" in dropped[text.name]
+    )
     assert details["kept"] == 7 and sum(details["dropped"].values()) == 4
 
 
