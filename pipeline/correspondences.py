@@ -115,16 +115,19 @@ def _consistent(one: Surface, two: Surface, config: CorrespondenceConfig, step: 
         index = np.flatnonzero((z > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height))
     x, y, z = x[index], y[index], z[index]
     on_object = two.mask.ravel()[y.astype(np.int32) * width + x.astype(np.int32)]
+    on_object = np.flatnonzero(on_object)
     index, x, y, z = index[on_object], x[on_object], y[on_object], z[on_object]
     seen = two.sampler(x, y)
-    visible = np.abs(z - seen) < config.depth_tolerance * seen  # False where view 2's depth is unknown (0)
+    # nowhere true where view 2's depth is unknown (0)
+    visible = np.flatnonzero(np.abs(z - seen) < config.depth_tolerance * seen)
     index, x, y, seen = index[visible], x[visible], y[visible], seen[visible]
     back, back_shift = _transfer(two.camera, one.camera)
     q = back @ np.stack([x * seen, y * seen, seen]) + back_shift
     origin = one.xy[:, ::step][:, index]
-    miss = np.hypot(q[0] / q[2] - origin[0], q[1] / q[2] - origin[1])
-    closed = miss <= config.cycle_px
-    return _Consistent(index[closed] * step, np.stack([x, y])[:, closed], miss[closed])
+    dx, dy = q[0] / q[2] - origin[0], q[1] / q[2] - origin[1]
+    miss = dx * dx + dy * dy
+    closed = np.flatnonzero(miss <= config.cycle_px**2)
+    return _Consistent(index[closed] * step, np.stack([x, y])[:, closed], np.sqrt(miss[closed]))
 
 
 def _transfer(first: Camera, second: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -148,7 +151,7 @@ class Match:
     Attributes:
         points: (N, 4) float32: x1, y1, x2, y2 in pixels of the views, centres at +0.5; farthest-point ordered.
         overlap: share of view 1's mask that has a match (of all matches, not only the N kept).
-        cycle_px: median miss of the cycle in pixels; nan without matches.
+        cycle_px: median miss of the cycle of the N kept, in pixels; nan without matches.
     """
 
     points: NDArray[np.float32]
@@ -165,7 +168,7 @@ def match(one: Surface, two: Surface, config: CorrespondenceConfig) -> Match:
     start = seeds.derive_seed("correspondences", config.seed, one.frame, two.frame) % n
     order = farthest_points(one.pixels[found.index], config.max_points, start)
     points = np.concatenate([one.xy[:, found.index[order]], found.xy2[:, order]]).T
-    return Match(np.ascontiguousarray(points), n / one.n_mask, float(np.median(found.miss_px)))
+    return Match(np.ascontiguousarray(points), n / one.n_mask, float(np.median(found.miss_px[order])))
 
 
 def match_views(view1: Surface, view2: Surface, config: CorrespondenceConfig) -> NDArray[np.float32]:

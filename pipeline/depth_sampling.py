@@ -33,10 +33,10 @@ class DepthSampler:
     def __call__(self, x: Floats, y: Floats) -> NDArray[np.float32]:
         """Depth (N,) at pixels x, y (N,) (centres at +0.5) that lie inside the image."""
         x, y = x - np.float32(0.5), y - np.float32(0.5)
-        left = np.clip(x, 0, self.width - 2).astype(np.int32)  # casting truncates, which is floor from 0 on
-        top = np.clip(y, 0, self.height - 2).astype(np.int32)
+        left = np.floor(np.clip(x, 0, self.width - 2))
+        top = np.floor(np.clip(y, 0, self.height - 2))
         a, b = np.clip(x - left, 0, 1), np.clip(y - top, 0, 1)  # the outermost half pixel repeats the border
-        corner = top * self.width + left
+        corner = top.astype(np.int32) * self.width + left.astype(np.int32)
         inverse = self._inverse
         upper = inverse[corner] * (1 - a) + inverse[corner + 1] * a
         lower = inverse[corner + self.width] * (1 - a) + inverse[corner + self.width + 1] * a
