@@ -71,6 +71,8 @@ class ScheduleConfig:
 
     epochs: int = 3000
     """Passes in which each object is seen `data.pairs_per_object` times."""
+    max_steps: int = 0
+    """Ends the run, and the fall of the learning rate, after so many steps though epochs are left; 0 = no limit."""
     shape: Literal["cosine", "constant"] = "cosine"
     """Cosine to 0 at the end, or constant."""
     per: Literal["epoch", "step"] = "epoch"
@@ -190,6 +192,7 @@ def check(config: TrainConfig) -> None:
         ("loss.chunk", config.loss.chunk >= 1, "must be at least 1"),
         ("optimiser.lr", config.optimiser.lr > 0, "must be positive"),
         ("schedule.epochs", schedule.epochs >= 1, "must be at least 1"),
+        ("schedule.max_steps", schedule.max_steps >= 0, "must not be negative"),
         ("schedule.warmup_steps", schedule.warmup_steps >= 0, "must not be negative"),
         ("momentum", 0 <= config.momentum <= 1, "must lie in [0, 1]"),
         ("validation.every", config.validation.every >= 0, "must not be negative"),

@@ -116,20 +116,26 @@ class SilentLog:
 
 
 class Meter:
-    """Speed over the last steps, the first one (which warms up) left out as soon as there is another."""
+    """Loss and speed of a call of `train`; speed over the last steps, without the first, which warms up."""
 
-    def __init__(self, window: int = 50) -> None:
-        self._marks: list[tuple[float, int]] = [(time.perf_counter(), 0)]
-        self._window, self.last_loss = window, float("nan")
+    def __init__(self, first_step: int, window: int = 50) -> None:
+        self.first_step, self.loss = first_step, float("nan")
+        self._began = time.perf_counter()
+        self._marks, self._window = [(self._began, 0)], window
 
     def add(self, pairs: int, loss: float) -> None:
         """Note a step."""
-        self.last_loss = loss
+        self.loss = loss
         self._marks = [*self._marks[-self._window :], (time.perf_counter(), self._marks[-1][1] + pairs)]
 
     @property
+    def seconds(self) -> float:
+        """Since the beginning."""
+        return time.perf_counter() - self._began
+
+    @property
     def pairs_per_second(self) -> float:
-        """0 before the first step."""
+        """Of all ranks together; 0 before the first step."""
         marks = self._marks[1:] if len(self._marks) > 2 else self._marks
         return (marks[-1][1] - marks[0][1]) / max(1e-9, marks[-1][0] - marks[0][0])
 

@@ -56,6 +56,9 @@ def read_index(folder: Path, split: str) -> SampleIndex:
     """
     manifest = read_manifest(folder)
     table = _read_table(folder / "index.parquet")
+    recorded = files.read_json(folder / "dataset.json").get("tables", {}).get("index.parquet")
+    if recorded is not None and files.sha256_of(folder / "index.parquet") != recorded:
+        raise BadInput("is not the one of dataset.json", where=folder / "index.parquet", remedy=REMAKE)
     sequences = np.unique(table["sequence"].to_numpy(zero_copy_only=False).astype(str))
     table = table.filter(pc.equal(table["split"], split))
     columns = {name: table[name].to_numpy(zero_copy_only=False) for name in COLUMNS}

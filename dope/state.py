@@ -63,6 +63,12 @@ def wrap(network: DopeNetwork, ranks: Ranks) -> nn.Module:
     return DistributedDataParallel(online, device_ids=[ranks.device] if ranks.device.type == "cuda" else None)
 
 
+def total_steps(config: TrainConfig, steps_per_epoch: int) -> int:
+    """Steps of a whole run: all epochs, or `schedule.max_steps` where that is less."""
+    steps = config.schedule.epochs * steps_per_epoch
+    return min(steps, config.schedule.max_steps) if config.schedule.max_steps else steps
+
+
 def learning_rate(config: TrainConfig, step: int, steps_per_epoch: int) -> float:
     """The learning rate of step `step` (from 0): linear warm-up, then cosine to 0 or constant."""
     schedule, peak = config.schedule, config.optimiser.lr
@@ -70,8 +76,9 @@ def learning_rate(config: TrainConfig, step: int, steps_per_epoch: int) -> float
         return peak * (step + 1) / (schedule.warmup_steps + 1)
     if schedule.shape == "constant":
         return peak
+    total = total_steps(config, steps_per_epoch)
     if schedule.per == "epoch":
-        share = (step // steps_per_epoch) / schedule.epochs
+        share = step // steps_per_epoch * steps_per_epoch / total
     else:
-        share = (step - schedule.warmup_steps) / max(1, schedule.epochs * steps_per_epoch - schedule.warmup_steps)
+        share = (step - schedule.warmup_steps) / max(1, total - schedule.warmup_steps)
     return peak * 0.5 * (1 + math.cos(math.pi * share))

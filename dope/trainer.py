@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from dope.distributed import Ranks, ranks_of
 from dope.heap import keep_heap
 from dope.order import SampleOrder
 from dope.run_logging import Meter, RunLog, SilentLog
-from dope.state import TrainState, learning_rate, new_state, wrap
+from dope.state import TrainState, learning_rate, new_state, total_steps, wrap
 from dope.step import compute_losses, sample_batch
 from dope.stop_signals import StopRequest
 from dope.streaming import PairDataset, PairLoader
@@ -39,8 +39,8 @@ def train(
         stop_after: stop with a checkpoint after so many steps of this call; the schedule stays that of the whole run.
 
     Returns:
-        `status` (finished, or stopped by a signal or `stop_after`), `step`, `epoch`, `loss`, `pck`, `pck_untrained`,
-        `mask_iou`, `checkpoint`, `seconds`, `pairs_per_second`.
+        `status` (finished, or stopped by a signal or `stop_after`), `step`, `steps_of_this_call`, `epoch`, `loss`,
+        `pck`, `pck_untrained`, `mask_iou`, `checkpoint`, `seconds`, `pairs_per_second`.
 
     Raises:
         BadInput: shards or checkpoint missing or damaged. UsageError: settings that do not fit them.
@@ -49,80 +49,155 @@ def train(
     check(config)
     keep_heap()
     with ranks_of(config.device) as ranks, StopRequest() as stop:
-        dataset = PairDataset(shards, "train", image_size=config.data.image_size, max_points=config.data.max_points)
-        order = SampleOrder(
-            dataset.index.objects,
-            config.data.batch_size,
-            pairs_per_object=config.data.pairs_per_object,
-            seed=config.seed,
-        )
-        held_out = read_held_out(shards, config, ranks)
-        state = new_state(config, ranks)
-        found = checkpoint_to_resume(out, resume)
-        if found is not None:
-            checkpoints.resume(found, state, config, dataset.index.fingerprint)
-        rows = order.batches(state.place, config.schedule.epochs, rank=ranks.rank, world=ranks.world)
-        online = wrap(state.network, ranks)
-        begun, first_step = time.perf_counter(), state.step
-        total = config.schedule.epochs * order.steps_per_epoch
-        last_step = total if stop_after is None else min(total, state.step + stop_after)
-        if ranks.is_first:
-            write_config(out, config)
-        log: RunLog | SilentLog = RunLog(out, start=state.step, total=total) if ranks.is_first else SilentLog()
-        with log:
-            start = {"world": ranks.world, "device": str(ranks.device), "config_hash": settings.config_hash(config)}
-            log.event("start", state.step, state.place.epoch, {**start, "resumed_from": found and str(found)})
-            if state.step == 0:
-                state.untrained = state.validation = validate(state, held_out, config, ranks, log)
-            meter, stopping = Meter(), state.step >= last_step
-            loader = PairLoader(dataset, rows, workers=config.data.workers, pin_memory=ranks.device.type == "cuda")
+        run = open_run(shards, out, config, ranks, resume)
+        state, last_step = run.state, run.total_steps
+        if stop_after is not None:
+            last_step = min(last_step, state.step + stop_after)
+        rows = run.order.batches(state.place, config.schedule.epochs, rank=ranks.rank, world=ranks.world)
+        loader = PairLoader(run.dataset, rows, workers=config.data.workers, pin_memory=ranks.device.type == "cuda")
+        online, meter = wrap(state.network, ranks), Meter(state.step)
+        with run.begin() as log:
+            stopping = state.step >= last_step
             for batch in loader if not stopping else ():
-                lr = learning_rate(config, state.step, order.steps_per_epoch)
+                lr = learning_rate(config, state.step, run.order.steps_per_epoch)
                 for group in state.optimiser.param_groups:
                     group["lr"] = lr
                 sampled = sample_batch(batch.to(ranks.device), config, state.step, ranks.rank)
                 losses = compute_losses(
                     online, state.momentum, sampled, config, ranks, step=state.step, stop=stop.requested
                 )
-                report = losses.report
-                if not math.isfinite(report["loss"]):
-                    raise not_finite(report, batch, state, out, ranks, log)
+                if not math.isfinite(losses.report["loss"]):
+                    raise run.not_finite(losses.report, batch, log)
                 state.optimiser.zero_grad(set_to_none=True)
                 losses.backward.backward()
                 state.optimiser.step()
                 state.momentum.update(state.network)
 
-                state.step, state.place = state.step + 1, order.after(state.place)
+                state.step, state.place = state.step + 1, run.order.after(state.place)
                 stopping = losses.stop or state.step >= last_step
-                meter.add(config.data.batch_size, report["loss"])
-                log.progress(state.step, report["loss"], meter.pairs_per_second)
-                if state.step % config.log_every == 0 or stopping:
-                    values = {**report, "lr": lr, "pairs_per_second": round(meter.pairs_per_second, 2)}
-                    log.event("step", state.step, state.place.epoch, values)
-                epoch_done = state.place.consumed == 0
-                if state.step == total or (epoch_done and _due(state.place.epoch, config.validation.every)):
-                    state.validation = validate(state, held_out, config, ranks, log)
-                if stopping or (epoch_done and _due(state.place.epoch, config.checkpoint.every)):
-                    save(out, state, config, dataset.index.fingerprint, ranks, log)
+                meter.add(config.data.batch_size, losses.report["loss"])
+                log.progress(state.step, meter.loss, meter.pairs_per_second)
+                if stopping or state.step % config.log_every == 0:
+                    speed = {"lr": lr, "pairs_per_second": round(meter.pairs_per_second, 2)}
+                    log.event("step", state.step, state.place.epoch, {**losses.report, **speed})
+                if state.step == run.total_steps or run.is_due(config.validation.every):
+                    run.validate(log)
+                if stopping or run.is_due(config.checkpoint.every):
+                    run.save(log)
                 if stopping:
                     break
-            newest = checkpoints.latest_checkpoint(out)
-            result = {
-                "status": "finished" if state.step >= total else "stopped",
-                "step": state.step,
-                "epoch": state.place.epoch,
-                "loss": meter.last_loss,
-                "pck": (state.validation or {}).get("pck"),
-                "pck_untrained": (state.untrained or {}).get("pck"),
-                "mask_iou": (state.validation or {}).get("mask_iou"),
-                "checkpoint": newest and str(newest),
-                "seconds": round(time.perf_counter() - begun, 1),
-                "steps_of_this_call": state.step - first_step,
-                "pairs_per_second": round(meter.pairs_per_second, 2),
-            }
-            log.event("end", state.step, state.place.epoch, result)
-        ranks.wait()
+            return run.end(meter, log)
+
+
+@dataclass
+class Run:
+    """What a call of `train` works on."""
+
+    out: Path
+    config: TrainConfig
+    ranks: Ranks
+    dataset: PairDataset
+    order: SampleOrder
+    held_out: list[PairBatch]
+    state: TrainState
+    resumed_from: Path | None
+
+    @property
+    def total_steps(self) -> int:
+        """Steps of the whole run."""
+        return total_steps(self.config, self.order.steps_per_epoch)
+
+    def is_due(self, every: int) -> bool:
+        """True at the end of each `every`-th epoch; never for 0."""
+        return every > 0 and self.state.place.consumed == 0 and self.state.place.epoch % every == 0
+
+    def begin(self) -> RunLog | SilentLog:
+        """Write the settings, open the log and validate the untrained network."""
+        if not self.ranks.is_first:
+            log: RunLog | SilentLog = SilentLog()
+        else:
+            write_config(self.out, self.config)
+            log = RunLog(self.out, start=self.state.step, total=self.total_steps)
+        facts = {
+            "world": self.ranks.world,
+            "device": str(self.ranks.device),
+            "config_hash": settings.config_hash(self.config),
+            "dataset": self.dataset.index.fingerprint,
+            "resumed_from": None if self.resumed_from is None else str(self.resumed_from),
+        }
+        log.event("start", self.state.step, self.state.place.epoch, facts)
+        if self.state.step == 0:
+            self.validate(log)
+            self.state.untrained = self.state.validation
+        return log
+
+    def validate(self, log: RunLog | SilentLog) -> None:
+        """PCK and mask IoU on all ranks' held-out pairs, logged and kept for the checkpoint."""
+        if self.config.validation.every == 0:
+            return
+        self.ranks.copy_from_first(self.state.network)  # the ranks' BatchNorm statistics differ by their last batch
+        result = pck(self.state.network, self.held_out, points=self.config.data.points, ranks=self.ranks)
+        if result["pairs"] > 0:
+            self.state.validation = result
+            log.event("validation", self.state.step, self.state.place.epoch, result)
+        elif self.state.step == 0:
+            log.say("no held-out pairs (split val): nothing is validated")
+
+    def save(self, log: RunLog | SilentLog) -> None:
+        """Write a checkpoint on the first rank."""
+        if self.ranks.is_first:
+            fingerprint, keep = self.dataset.index.fingerprint, self.config.checkpoint.keep
+            path = checkpoints.save_checkpoint(self.out, self.state, self.config, fingerprint, keep)
+            log.event("checkpoint", self.state.step, self.state.place.epoch, {"file": path.name})
+
+    def not_finite(self, report: dict[str, float], batch: PairBatch, log: RunLog | SilentLog) -> DopeError:
+        """The error of a loss that is NaN or infinite; the weights are still those before it."""
+        step, keys = self.state.step, [key for part in self.ranks.collect(list(batch.keys)) for key in part]
+        log.event("not_finite", step, self.state.place.epoch, {"keys": keys})
+        some = ", ".join(keys[:16]) + (f" and {len(keys) - 16} more (see metrics.jsonl)" if len(keys) > 16 else "")
+        newest = checkpoints.latest_checkpoint(self.out)
+        return DopeError(
+            f"the loss is {report['loss']} at step {step} (contrastive {report['contrastive']}, "
+            f"mask {report['mask']}); the batch held {some}",
+            where=self.out,
+            remedy="Lower --set optimiser.lr or raise --set schedule.warmup_steps, and look at these samples"
+            + (f"; {newest.name} was written before" if newest else ""),
+        )
+
+    def end(self, meter: Meter, log: RunLog | SilentLog) -> dict[str, Any]:
+        """The result of `train`, once all ranks are done."""
+        self.ranks.wait()
+        newest = checkpoints.latest_checkpoint(self.out)
+        result = {
+            "status": "finished" if self.state.step >= self.total_steps else "stopped",
+            "step": self.state.step,
+            "steps_of_this_call": self.state.step - meter.first_step,
+            "epoch": self.state.place.epoch,
+            "loss": meter.loss,
+            "pck": (self.state.validation or {}).get("pck"),
+            "pck_untrained": (self.state.untrained or {}).get("pck"),
+            "mask_iou": (self.state.validation or {}).get("mask_iou"),
+            "checkpoint": None if newest is None else str(newest),
+            "seconds": round(meter.seconds, 1),
+            "pairs_per_second": round(meter.pairs_per_second, 2),
+        }
+        log.event("end", self.state.step, self.state.place.epoch, result)
         return result
+
+
+def open_run(shards: Path, out: Path, config: TrainConfig, ranks: Ranks, resume: str | Path) -> Run:
+    """Check the shards, make the network, and go back to where the run stopped; nothing is written yet."""
+    data = config.data
+    dataset = PairDataset(shards, "train", image_size=data.image_size, max_points=data.max_points)
+    order = SampleOrder(
+        dataset.index.objects, data.batch_size, pairs_per_object=data.pairs_per_object, seed=config.seed
+    )
+    held_out = read_held_out(shards, config, ranks)
+    state = new_state(config, ranks)
+    found = checkpoint_to_resume(out, resume)
+    if found is not None:
+        checkpoints.resume(found, state, config, dataset.index.fingerprint)
+    return Run(out, config, ranks, dataset, order, held_out, state, found)
 
 
 def read_held_out(shards: Path, config: TrainConfig, ranks: Ranks) -> list[PairBatch]:
@@ -133,31 +208,6 @@ def read_held_out(shards: Path, config: TrainConfig, ranks: Ranks) -> list[PairB
     mine = list(range(min(config.validation.pairs, len(dataset))))[ranks.rank :: ranks.world]
     size = config.validation.batch_size
     return list(PairLoader(dataset, [mine[i : i + size] for i in range(0, len(mine), size)]))
-
-
-def validate(
-    state: TrainState, held_out: list[PairBatch], config: TrainConfig, ranks: Ranks, log: RunLog | SilentLog
-) -> dict[str, float] | None:
-    """PCK and mask IoU on all ranks' held-out pairs, logged; None where there are none."""
-    if config.validation.every == 0:
-        return None
-    ranks.copy_from_first(state.network)  # the ranks' BatchNorm statistics differ by their last batch
-    result = pck(state.network, held_out, points=config.data.points, ranks=ranks)
-    if result["pairs"] == 0:
-        if state.step == 0:
-            log.say("no held-out pairs (split val): nothing is validated")
-        return None
-    log.event("validation", state.step, state.place.epoch, result)
-    return result
-
-
-def save(
-    out: Path, state: TrainState, config: TrainConfig, dataset: str, ranks: Ranks, log: RunLog | SilentLog
-) -> None:
-    """Write a checkpoint on the first rank."""
-    if ranks.is_first:
-        path = checkpoints.save_checkpoint(out, state, config, dataset, config.checkpoint.keep)
-        log.event("checkpoint", state.step, state.place.epoch, {"file": path.name})
 
 
 def checkpoint_to_resume(out: Path, resume: str | Path) -> Path | None:
@@ -178,32 +228,8 @@ def checkpoint_to_resume(out: Path, resume: str | Path) -> Path | None:
 
 def write_config(out: Path, config: TrainConfig) -> None:
     """RUN/config.yaml, which `--config` reads again, with its hash in the first line."""
-    values = settings.to_dict(config)
-    text = yaml.safe_dump(_plain(values), sort_keys=False, allow_unicode=True)
+    text = yaml.safe_dump(_plain(settings.to_dict(config)), sort_keys=False, allow_unicode=True)
     files.write_bytes(out / "config.yaml", f"# hash {settings.config_hash(config)}\n{text}".encode())
-
-
-def not_finite(
-    report: dict[str, float], batch: PairBatch, state: TrainState, out: Path, ranks: Ranks, log: RunLog | SilentLog
-) -> DopeError:
-    """The error of a loss that is NaN or infinite; the weights are still those before it."""
-    keys = [key for part in ranks.collect(list(batch.keys)) for key in part]
-    log.event(
-        "not_finite", state.step, state.place.epoch, {"losses": {k: str(v) for k, v in report.items()}, "keys": keys}
-    )
-    some = ", ".join(keys[:16]) + (f" and {len(keys) - 16} more (in metrics.jsonl)" if len(keys) > 16 else "")
-    newest = checkpoints.latest_checkpoint(out)
-    return DopeError(
-        f"the loss is {report['loss']} at step {state.step} (contrastive {report['contrastive']}, mask "
-        f"{report['mask']}); the batch held {some}",
-        where=out,
-        remedy="Lower --set optimiser.lr or raise --set schedule.warmup_steps, and look at these samples"
-        + (f"; {newest.name} was written before" if newest else ""),
-    )
-
-
-def _due(epoch: int, every: int) -> bool:
-    return every > 0 and epoch % every == 0
 
 
 def _plain(value: Any) -> Any:

@@ -166,7 +166,19 @@ def drop_column(folder: Path) -> None:
     pq.write_table(pq.read_table(folder / "index.parquet").drop_columns(["offset"]), folder / "index.parquet")
 
 
+def another_index(folder: Path) -> None:
+    table = pq.read_table(folder / "index.parquet")
+    pq.write_table(table.take(list(reversed(range(len(table))))), folder / "index.parquet")
+
+
+def forget_hashes(folder: Path) -> None:
+    manifest = json.loads((folder / "dataset.json").read_text())
+    del manifest["tables"]
+    (folder / "dataset.json").write_text(json.dumps(manifest))
+
+
 def drop_rows(folder: Path) -> None:
+    forget_hashes(folder)
     pq.write_table(pq.read_table(folder / "index.parquet").slice(1), folder / "index.parquet")
 
 
@@ -187,6 +199,7 @@ def no_shards_listed(folder: Path) -> None:
         (exchange_with_same_size, "train-000001.tar", "different datasets"),
         (garble_index, "index.parquet", "cannot be read"),
         (drop_column, "index.parquet", "lacks the columns offset"),
+        (another_index, "index.parquet", "is not the one of dataset.json"),
         (drop_rows, "train-000000.tar", "9 samples of it, dataset.json 10"),
         (unfinished, "copy", "no dataset.json"),
         (no_shards_listed, "dataset.json", "lists no shards"),

@@ -84,6 +84,12 @@ def test_stopping_and_going_on_is_bitwise_the_same(shards: Path, tmp_path: Path)
     assert all(torch.equal(ours[name], theirs[name]) for name in ours)
 
 
+def test_max_steps_ends_a_run(shards: Path, tmp_path: Path) -> None:
+    result = train(shards, tmp_path, tiny("schedule.max_steps=3"))
+    assert (result["status"], result["step"], result["epoch"]) == ("finished", 3, 1)
+    assert [line["step"] for line in read_metrics(tmp_path, "validation")] == [0, 2, 3]
+
+
 def test_another_seed_gives_another_run(shards: Path, tmp_path: Path) -> None:
     for seed in (1, 2):
         train(shards, tmp_path / str(seed), tiny(f"seed={seed}", "schedule.epochs=1", "validation.every=0"))
@@ -259,6 +265,8 @@ def test_learning_rates() -> None:
     rates = [learning_rate(config, step, 12) for step in range(24)]
     assert rates[:4] == pytest.approx([0.2, 0.4, 0.6, 0.8]) and rates[4] == 1.0
     assert rates[14] == pytest.approx(0.5) and rates[4:] == sorted(rates[4:], reverse=True)
+    short = load_config("nano", None, ["schedule.warmup_steps=0", "schedule.max_steps=20", "schedule.epochs=99"])
+    assert learning_rate(short, 10, 12) == pytest.approx(short.optimiser.lr / 2)
     constant = load_config("nano", None, ["schedule.shape=constant", "schedule.warmup_steps=0"])
     assert {learning_rate(constant, step, 12) for step in range(99)} == {constant.optimiser.lr}
 

@@ -16,6 +16,8 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from webdataset import TarWriter
 
+TABLES = ("index.parquet", "views.parquet")
+
 
 @dataclass
 class TinyPair:
@@ -102,7 +104,8 @@ def write_shards(
     pq.write_table(pa.Table.from_pylist(index), folder / "index.parquet")
     pq.write_table(pa.Table.from_pylist(views), folder / "views.parquet")
     counts = {"pairs": len(index), "views": len(views), "objects": n_objects + val_objects}
-    manifest = {"counts": counts, "shards": shards, "settings": {"seed": seed, "size": size}, "versions": {}}
+    tables = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in TABLES}
+    manifest = {"counts": counts, "shards": shards, "tables": tables, "settings": {"seed": seed}, "versions": {}}
     (folder / "dataset.json").write_text(json.dumps(manifest, indent=1))
     return folder
 
