@@ -39,12 +39,15 @@ class Visible:
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
         """Values (V, C) at vertices to rows, columns and values (N, C) at the N pixels that show a face."""
         rows, columns = np.nonzero(self.face >= 0)
-        shown = self.face[rows, columns]
-        # one (3, C) matrix a face: the affine functions on the screen of values / depth
-        coefficients = np.einsum("fki,fkc->fic", self.planes, values[faces])[shown]
-        x, y = (columns + 0.5)[:, None], (rows + 0.5)[:, None]
-        numerators = coefficients[:, 0] * x + coefficients[:, 1] * y + coefficients[:, 2]
-        return rows, columns, numerators / self.nearness[rows, columns, None]
+        face = self.face[rows, columns]
+        seen = np.zeros(len(faces), bool)
+        seen[face] = True
+        shown, owner = np.flatnonzero(seen), (np.cumsum(seen) - 1)[face]
+        # affine functions on the screen of values / depth, for the faces that are seen
+        slopes = np.einsum("fki,fkc->cif", self.planes[shown], values[faces[shown]])
+        x, y, nearness = columns + 0.5, rows + 0.5, self.nearness[rows, columns]
+        found = [(a[owner] * x + b[owner] * y + c[owner]) / nearness for a, b, c in slopes]
+        return rows, columns, np.stack(found, axis=1)
 
 
 def rasterise(
@@ -59,47 +62,61 @@ def rasterise(
         faces: (F, 3) vertex indices, clockwise on the screen when seen from the front.
         cull: drop triangles that are seen from behind.
     """
-    corners = xy[faces]
-    (x0, y0), (x1, y1), (x2, y2) = (corners[:, k].T for k in range(3))
+    # column by column: NumPy is slow at reducing many short rows
+    (x0, y0), (x1, y1), (x2, y2) = (xy[corner].T for corner in faces.T)
     double_area = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
-    low, high = corners.min(1), corners.max(1)
-    keep = (nearness[faces] > 0).all(1) & (double_area > 1e-9 if cull else np.abs(double_area) > 1e-9)
-    keep &= (high[:, 0] > 0) & (low[:, 0] < width) & (high[:, 1] > 0) & (low[:, 1] < height)
+    keep = (double_area if cull else np.abs(double_area)) > 1e-9
+    keep &= _smallest(*nearness[faces.T]) > 0
+    left, right, top, bottom = _smallest(x0, x1, x2), _largest(x0, x1, x2), _smallest(y0, y1, y2), _largest(y0, y1, y2)
+    keep &= (right > 0.5) & (left < width - 0.5) & (bottom > 0.5) & (top < height - 0.5)
+    kept = np.flatnonzero(keep)
+    x0, y0, x1, y1, x2, y2, double_area = (values[kept] for values in (x0, y0, x1, y1, x2, y2, double_area))
 
     # Edge functions A x + B y + C, zero on the edge opposite to corner k and 1 at the corner: barycentric coordinates.
     # C is an antisymmetric product, so two triangles agree to the bit about the edge they share: no cracks.
-    A = np.stack([y1 - y2, y2 - y0, y0 - y1], axis=1)
-    B = np.stack([x2 - x1, x0 - x2, x1 - x0], axis=1)
-    C = np.stack([x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0], axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        barycentric = np.stack([A, B, C], axis=2) / double_area[:, None, None]
-    planes = np.where(keep[:, None, None], barycentric, 0.0) * nearness[faces][:, :, None]
-    depth_plane = planes.sum(1)
+    A = (y1 - y2, y2 - y0, y0 - y1)
+    B = (x2 - x1, x0 - x2, x1 - x0)
+    C = (x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0)
+    planes = np.zeros((len(faces), 3, 3))
+    for k in range(3):
+        weight = nearness[faces[kept, k]] / double_area
+        planes[kept, k] = np.stack([A[k] * weight, B[k] * weight, C[k] * weight], axis=1)
 
-    index = np.flatnonzero(keep)
-    first = np.maximum(np.ceil(low[index, 1] - 0.5), 0).astype(np.intp)
-    last = np.minimum(np.floor(high[index, 1] - 0.5), height - 1).astype(np.intp)
+    first = np.maximum(np.ceil(top[kept] - 0.5), 0).astype(np.intp)
+    last = np.minimum(np.floor(bottom[kept] - 0.5), height - 1).astype(np.intp)
     which, row = _runs(first, last)
-    index = index[which]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        crossing = -(B[index] * (row[:, None] + 0.5) + C[index]) / A[index]
-    flip = np.sign(double_area[index])[:, None]
-    left = np.where(A[index] * flip > 0, crossing, -np.inf).max(1)
-    right = np.where(A[index] * flip < 0, crossing, np.inf).min(1)
-    first = np.clip(np.ceil(left - 0.5), 0, width).astype(np.intp)
-    last = np.clip(np.floor(right - 0.5), -1, width - 1).astype(np.intp)
-    which, column = _runs(first, last)
-    index, row = index[which], row[which]
+    start, stop = np.full(len(which), -np.inf), np.full(len(which), np.inf)
+    y = row + 0.5
+    flip = np.sign(double_area)
+    for k in range(3):
+        slope = A[k][which]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            crossing = -(B[k][which] * y + C[k][which]) / slope
+        slope *= flip[which]
+        np.maximum(start, crossing, out=start, where=slope > 0)
+        np.minimum(stop, crossing, out=stop, where=slope < 0)
+    first = np.clip(np.ceil(start - 0.5), 0, width).astype(np.intp)
+    last = np.clip(np.floor(stop - 0.5), -1, width - 1).astype(np.intp)
+    run, column = _runs(first, last)
+    index = kept[which]
 
-    plane = depth_plane[index]
-    candidate = plane[:, 0] * (column + 0.5) + plane[:, 1] * (row + 0.5) + plane[:, 2]
-    pixel = row * width + column
+    a, b, c = planes.sum(1)[index].T
+    candidate = a[run] * (column + 0.5) + (b * y + c)[run]
+    pixel = (row * width)[run] + column
     buffer = np.zeros(width * height)
     np.maximum.at(buffer, pixel, candidate)
     face = np.full(width * height, -1, dtype=np.int32)
     won = (candidate == buffer[pixel]) & (candidate > 0)
-    face[pixel[won]] = index[won]
+    face[pixel[won]] = index[run[won]]
     return Visible(face.reshape(height, width), buffer.reshape(height, width), planes)
+
+
+def _smallest(a: Floats, b: Floats, c: Floats) -> Floats:
+    return np.minimum(np.minimum(a, b), c)
+
+
+def _largest(a: Floats, b: Floats, c: Floats) -> Floats:
+    return np.maximum(np.maximum(a, b), c)
 
 
 def project(camera: Camera, points: Floats) -> tuple[Floats, Floats]:
