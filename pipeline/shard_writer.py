@@ -180,8 +180,11 @@ class HashingFile:
         self.file.close()
 
 
-def write_tar(path: Path, samples: Iterable[PairSample | ViewSample]) -> WrittenShard:
+def write_tar(path: Path, samples: Iterable[PairSample | ViewSample], name: str | None = None) -> WrittenShard:
     """Write one shard and sync it; equal samples give equal bytes.
+
+    Args:
+        name: of the shard, where `path` is a temporary one.
 
     Raises:
         BadInput: a file of a sequence cannot be read.
@@ -189,7 +192,7 @@ def write_tar(path: Path, samples: Iterable[PairSample | ViewSample]) -> Written
     """
     from webdataset.writer import TarWriter  # imports torch, which nothing else here needs
 
-    rows = []
+    rows, name = [], name or path.name
     file = HashingFile(path)
     try:
         tar = TarWriter(file, mtime=0, encoder=False)
@@ -197,14 +200,14 @@ def write_tar(path: Path, samples: Iterable[PairSample | ViewSample]) -> Written
             members, row = _encode(sample)
             offset = tar.tarstream.offset
             tar.write(members)
-            rows.append({**row, "shard": path.name, "offset": offset, "size": tar.tarstream.offset - offset})
+            rows.append({**row, "shard": name, "offset": offset, "size": tar.tarstream.offset - offset})
         tar.close()
         file.file.flush()
         os.fsync(file.file.fileno())
     finally:
         file.close()
     entry = {"samples": len(rows), "bytes": path.stat().st_size, "sha256": file.digest.hexdigest()}
-    return WrittenShard(path.name, entry, rows)
+    return WrittenShard(name, entry, rows)
 
 
 def _encode(sample: PairSample | ViewSample) -> tuple[dict[str, Any], dict[str, Any]]:

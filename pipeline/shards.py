@@ -16,8 +16,10 @@ import pyarrow.parquet as pq
 import dope
 from dope.common import files, seeds, settings
 from dope.common.errors import BadInput, UsageError
+from pipeline.engines import Share
 from pipeline.holdout import held_out_arc, held_out_objects
 from pipeline.sequence import Sequence
+from pipeline.shard_parts import Plan, write_part
 from pipeline.shard_writer import PairSample, SequenceContents, ViewSample, WrittenShard, write_tar
 from pipeline.stages import read_marker
 
@@ -58,6 +60,8 @@ class ShardsConfig:
 Progress = Callable[[int, int], None]
 """Called with the samples written and the samples in all."""
 
+EVERYTHING = Share()
+
 
 def write_shards(
     sequences: list[Sequence],
@@ -66,14 +70,18 @@ def write_shards(
     progress: Progress | None = None,
     *,
     overwrite: bool = False,
+    share: Share = EVERYTHING,
 ) -> dict[str, Any]:
     """Pack the views and pairs of sequences whose correspond stage is ok into `out`.
 
     The old contents of `out` stay until the new are whole. The order of `sequences` does not matter.
 
+    Args:
+        share: the part of the tars that this container writes; the last to finish completes the folder.
+
     Returns:
-        Counts by split, sequences left out with reasons, sequences without validation pairs, and "skipped": True where
-        `out` already holds exactly this.
+        Counts by split, sequences left out with reasons, sequences without validation pairs, "skipped": True where
+        `out` already holds exactly this, and for a share "waiting_for": how many tars others have still to write.
 
     Raises:
         BadInput: no sequence can be used, or two have the same id.
@@ -93,28 +101,49 @@ def write_shards(
     mark = settings.config_hash(
         {"format": FORMAT, "config": settings.to_dict(config), "sequences": marks, "left_out": left_out}
     )
-    if not overwrite and (done := _same_dataset(out, mark)):
-        return {**done, "skipped": True}
-    pairs, views, details = _split(contents, config)
+    if not overwrite and (there := _same_dataset(out, mark)):
+        return {**there, "skipped": True}
+    plan, details = _plan(contents, config)
     details["left_out"] = left_out
-    with files.atomic_folder(out) as folder:
-        written = _write_all(folder, {**pairs, "views": views}, config, progress)
-        rows = [row for shard in written if not shard.name.startswith("views-") for row in shard.rows]
-        pq.write_table(pa.Table.from_pylist(rows, INDEX_SCHEMA), folder / "index.parquet")
-        rows = [row for shard in written if shard.name.startswith("views-") for row in shard.rows]
-        pq.write_table(pa.Table.from_pylist(rows, VIEWS_SCHEMA), folder / "views.parquet")
+    ours = share.of(plan)
+    total, done = sum(len(samples) for _, samples in ours), 0
+
+    def report(n: int) -> None:
+        nonlocal done
+        done += n
+        if progress:
+            progress(done, total)
+
+    def finish(folder: Path, written: list[WrittenShard]) -> None:
         details["bytes"] = sum(shard.entry["bytes"] for shard in written)
-        manifest = {
-            "format": FORMAT,
-            "fingerprint": mark,
-            "counts": details,
-            "settings": settings.to_dict(config),
-            "shards": {shard.name: shard.entry for shard in written},
-            "tables": {name: files.sha256_of(folder / name) for name in ("index.parquet", "views.parquet")},
-            "versions": {"dope": dope.__version__, "numpy": np.__version__, "pyarrow": pa.__version__},
-        }
-        files.write_json(folder / "dataset.json", manifest)
+        _write_tables(folder, written, {"fingerprint": mark, "counts": details, "settings": settings.to_dict(config)})
+
+    if share.count > 1:
+        waiting_for = write_part(out, mark, plan, share, finish, report)
+        return {**details, "skipped": False, "waiting_for": waiting_for}
+    with files.atomic_folder(out) as folder:
+        written = []
+        for name, samples in plan:
+            written.append(write_tar(folder / name, samples))
+            report(len(samples))
+        finish(folder, written)
     return {**details, "skipped": False}
+
+
+def _write_tables(folder: Path, written: list[WrittenShard], facts: dict[str, Any]) -> None:
+    """index.parquet, views.parquet and, last, dataset.json beside the tars."""
+    for name, schema, of_views in (("index.parquet", INDEX_SCHEMA, False), ("views.parquet", VIEWS_SCHEMA, True)):
+        rows = [row for shard in written if shard.name.startswith("views-") == of_views for row in shard.rows]
+        with files.atomic_path(folder / name) as partial:
+            pq.write_table(pa.Table.from_pylist(rows, schema), partial)
+    manifest = {
+        "format": FORMAT,
+        **facts,
+        "shards": {shard.name: shard.entry for shard in written},
+        "tables": {name: files.sha256_of(folder / name) for name in ("index.parquet", "views.parquet")},
+        "versions": {"dope": dope.__version__, "numpy": np.__version__, "pyarrow": pa.__version__},
+    }
+    files.write_json(folder / "dataset.json", manifest)
 
 
 def verify_shards(folder: Path) -> dict[str, int]:
@@ -226,10 +255,8 @@ def _same_dataset(out: Path, mark: str) -> dict[str, Any] | None:
         return None  # absent or damaged: it will be written anew
 
 
-def _split(
-    contents: list[SequenceContents], config: ShardsConfig
-) -> tuple[dict[str, list[PairSample]], list[ViewSample], dict[str, Any]]:
-    """Which sample goes where: pairs of each split in rounds, views in order, and the counts."""
+def _plan(contents: list[SequenceContents], config: ShardsConfig) -> tuple[Plan, dict[str, Any]]:
+    """Name and samples of every tar (pairs of each split in rounds, views in order), and the counts."""
     objects = {one.id: (one.category, one.instance) for one in contents}
     val_ids = held_out_objects(objects, config.val_fraction, config.seed) if config.holdout == "sequences" else set()
     of_object: dict[str, list[list[PairSample]]] = {"train": [], "val": []}
@@ -258,7 +285,14 @@ def _split(
     }
     if config.holdout == "sequences":
         details["val_sequences"] = sorted(val_ids)
-    return pairs, views, details
+    plan: Plan = []
+    kinds: list[tuple[str, list[PairSample] | list[ViewSample]]] = [*pairs.items(), ("views", views)]
+    for kind, samples in kinds:
+        n_shards = -(-len(samples) // config.samples_per_shard)
+        ends = [len(samples) * (k + 1) // n_shards for k in range(n_shards)]
+        for k, (start, end) in enumerate(zip([0, *ends], ends, strict=False)):
+            plan.append((f"{kind}-{k:06d}.tar", samples[start:end]))
+    return plan, details
 
 
 def rounds(samples: list[list[PairSample]], seed: int, split: str) -> Iterator[PairSample]:
@@ -267,21 +301,3 @@ def rounds(samples: list[list[PairSample]], seed: int, split: str) -> Iterator[P
         there = [of_object[n] for of_object in samples if len(of_object) > n]
         for k in seeds.generator("round", seed, split, n).permutation(len(there)):
             yield there[k]
-
-
-def _write_all(
-    folder: Path,
-    samples: dict[str, Any],
-    config: ShardsConfig,
-    progress: Progress | None,
-) -> list[WrittenShard]:
-    written, total, done = [], sum(map(len, samples.values())), 0
-    for kind, of_kind in samples.items():
-        n_shards = -(-len(of_kind) // config.samples_per_shard)
-        ends = [len(of_kind) * (k + 1) // n_shards for k in range(n_shards)]
-        for k, (start, end) in enumerate(zip([0, *ends], ends, strict=False)):
-            written.append(write_tar(folder / f"{kind}-{k:06d}.tar", of_kind[start:end]))
-            done += end - start
-            if progress:
-                progress(done, total)
-    return written

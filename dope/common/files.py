@@ -53,24 +53,28 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     """Yield an empty temporary folder beside `path`; on success it takes the place of `path`, else it is deleted."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY}")
-    old = partial.with_name(f"{partial.name}.old")
     shutil.rmtree(partial, ignore_errors=True)
     with explaining_full_disk(path):
         try:
             partial.mkdir()
             yield partial
-            try:
-                if path.exists():
-                    path.replace(old)  # two renames: the moment without either folder does not grow with its size
-                partial.replace(path)
-            except BaseException:
-                if old.exists() and not path.exists():
-                    old.replace(path)
-                raise
+            replace_folder(partial, path)
         finally:
             shutil.rmtree(partial, ignore_errors=True)
-            if path.exists():
-                shutil.rmtree(old, ignore_errors=True)
+
+
+def replace_folder(new: Path, path: Path) -> None:
+    """Put the folder `new` in the place of `path`, which may exist; on failure `path` is what it was."""
+    old = path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY}.old")
+    try:
+        if path.exists():
+            path.replace(old)  # two renames: the moment without either folder does not grow with its size
+        new.replace(path)
+    except BaseException:
+        if old.exists() and not path.exists():
+            old.replace(path)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
 
 
 def write_bytes(path: Path, data: bytes) -> None:

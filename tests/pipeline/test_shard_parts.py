@@ -1,0 +1,94 @@
+"""Containers of an array job that write one folder of shards together."""
+
+import multiprocessing
+import shutil
+from pathlib import Path
+
+import pytest
+from synthetic import orbit, write_sequence
+
+from dope.common.errors import DiskFull
+from pipeline import shard_parts
+from pipeline.correspondences import CorrespondConfig, correspond
+from pipeline.engines import Share
+from pipeline.sequence import Sequence
+from pipeline.shards import ShardsConfig, verify_shards, write_shards
+from pipeline.stages import run_stage
+from pipeline.views import ViewsConfig
+
+CONFIG = ShardsConfig(samples_per_shard=7, holdout="none")
+
+
+@pytest.fixture(scope="module")
+def sequences(tmp_path_factory: pytest.TempPathFactory) -> list[Sequence]:
+    work = tmp_path_factory.mktemp("work")
+    first = write_sequence(work / "one", orbit(8, width=80, height=60, focal=95))
+    config = CorrespondConfig(ViewsConfig(every=1))
+    assert run_stage(first, "correspond", config, "", lambda: correspond(first, config)).ok
+    shutil.copytree(first.folder, work / "two")
+    return [first, Sequence(work / "two")]
+
+
+@pytest.fixture(scope="module")
+def alone(sequences: list[Sequence], tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The bytes that a single run writes."""
+    out = tmp_path_factory.mktemp("alone") / "out"
+    write_shards(sequences, out, CONFIG)
+    return bytes_of(out)
+
+
+def bytes_of(out: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in out.iterdir()}
+
+
+def test_the_last_part_completes_the_folder(sequences: list[Sequence], alone: dict[str, bytes], tmp_path: Path) -> None:
+    out, waiting = tmp_path / "out", []
+    for index in (2, 0, 1):
+        assert not out.exists()
+        waiting.append(write_shards(sequences, out, CONFIG, share=Share(index, 3))["waiting_for"])
+    n_tars = sum(name.endswith(".tar") for name in alone)
+    assert waiting[0] > waiting[1] > waiting[2] == 0 and waiting[0] == n_tars - len(range(2, n_tars, 3))
+    assert bytes_of(out) == alone
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert write_shards(sequences, out, CONFIG, share=Share(1, 3))["skipped"]
+
+
+def _part(sequences: list[Sequence], out: Path, index: int) -> None:
+    write_shards(sequences, out, CONFIG, share=Share(index, 4))
+
+
+def test_parts_at_the_same_time(sequences: list[Sequence], alone: dict[str, bytes], tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    context = multiprocessing.get_context("fork")
+    children = [context.Process(target=_part, args=(sequences, out, index)) for index in range(4)]
+    for child in children:
+        child.start()
+    for child in children:
+        child.join(120)
+    assert [child.exitcode for child in children] == [0] * 4
+    assert bytes_of(out) == alone
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_part_that_broke_off_goes_on_and_the_old_dataset_stays(
+    sequences: list[Sequence], alone: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    write_shards(sequences[:1], out, CONFIG)
+    before, real, written = bytes_of(out), shard_parts.write_tar, []
+
+    def write_tar(path: Path, samples: list, name: str) -> shard_parts.WrittenShard:
+        written.append(name)
+        if len(written) == 3:
+            raise OSError(28, "No space left on device")
+        return real(path, samples, name)
+
+    monkeypatch.setattr(shard_parts, "write_tar", write_tar)
+    with pytest.raises(DiskFull):
+        write_shards(sequences, out, CONFIG, share=Share(0, 2))
+    assert bytes_of(out) == before
+    write_shards(sequences, out, CONFIG, share=Share(0, 2))
+    assert len(written) - len(set(written)) == 1  # only the tar that failed was begun again
+    write_shards(sequences, out, CONFIG, share=Share(1, 2))
+    assert bytes_of(out) == alone
+    verify_shards(out)
