@@ -1,0 +1,89 @@
+"""Which pairs of frames are matched: neighbours in time, all of them, or those that look alike."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Pair = tuple[int, int]
+"""Positions of two frames, the smaller first."""
+
+SIFT_NORM = 512.0  # COLMAP's 8-bit SIFT descriptors have about this length
+
+
+def exhaustive_pairs(n: int) -> list[Pair]:
+    """All pairs of `n` frames."""
+    return list(combinations(range(n), 2))
+
+
+def neighbour_pairs(n: int, gaps: Iterable[int], *, wrap_around: bool) -> list[Pair]:
+    """Pairs of frames that lie a gap apart; with `wrap_around` the last frame is followed by the first again."""
+    pairs = set()
+    for gap in gaps:
+        for first in range(n if wrap_around else n - gap):
+            second = (first + gap) % n
+            if first != second:
+                pairs.add((min(first, second), max(first, second)))
+    return sorted(pairs)
+
+
+def similarity_votes(
+    features: Sequence[tuple[NDArray[np.float32], NDArray[np.uint8]]], n_features: int, max_ratio: float = 0.8
+) -> NDArray[np.int64]:
+    """How many of their largest features two images share, for all pairs: cheap enough for hundreds of images.
+
+    The `n_features` of largest scale are mutual nearest neighbours and pass Lowe's ratio test (IJCV 2004). Products of
+    8-bit descriptors are whole numbers below 2^24, exact in float32: the result does not depend on the BLAS.
+
+    Args:
+        features: for each image keypoints (N, 4: x, y, scale, angle) and descriptors (N, 128).
+
+    Returns:
+        symmetric (n, n) counts, 0 on the diagonal.
+    """
+    largest = []
+    for keypoints, descriptors in features:
+        order = np.argsort(-keypoints[:, 2], kind="stable")[:n_features]
+        largest.append(descriptors[order].astype(np.float32))
+    votes = np.zeros((len(features), len(features)), dtype=np.int64)
+    for i, j in exhaustive_pairs(len(features)):
+        if min(len(largest[i]), len(largest[j])) < 2:
+            continue
+        products = largest[i] @ largest[j].T
+        rows = np.arange(len(products))
+        nearest = products.argmax(axis=1)
+        best = products[rows, nearest].copy()
+        mutual = products.argmax(axis=0)[nearest] == rows
+        products[rows, nearest] = -1
+        # squared distances of vectors of one length; descriptors are not exactly that long, hence the lower bound
+        first, second = (np.maximum(2 - 2 * p / SIFT_NORM**2, 0) for p in (best, products.max(axis=1)))
+        votes[i, j] = votes[j, i] = np.count_nonzero(mutual & (first < max_ratio**2 * second))
+    return votes
+
+
+def most_similar_pairs(votes: NDArray[np.int64], neighbours: int) -> list[Pair]:
+    """Each frame with the `neighbours` frames that share most with it; frames that share nothing are no pair."""
+    pairs = set()
+    for i, row in enumerate(votes):
+        for j in np.argsort(-row, kind="stable")[:neighbours]:
+            if row[j] > 0:
+                pairs.add((min(i, int(j)), max(i, int(j))))
+    return sorted(pairs)
+
+
+def largest_component(n: int, pairs: Iterable[Pair]) -> int:
+    """Number of frames in the largest connected component of the graph of pairs: no model can have more."""
+    parent = list(range(n))
+
+    def root(node: int) -> int:
+        while parent[node] != node:
+            parent[node] = parent[parent[node]]
+            node = parent[node]
+        return node
+
+    for first, second in pairs:
+        parent[root(first)] = root(second)
+    return int(np.bincount([root(node) for node in range(n)]).max(initial=0)) if n else 0

@@ -1,0 +1,126 @@
+"""Can this model be real? Measures of a sparse model, and what speaks against it.
+
+A camera that only turns on the spot, frames that are all the same, or two accidental matches also give "a model": they
+show in its few points and in the small angles between its rays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import colmap
+from pipeline.geometry import Floats
+from pipeline.sequence import Frame
+
+
+@dataclass(frozen=True)
+class CheckConfig:
+    """What a model must have to be believed."""
+
+    min_share: float = 0.3
+    """Share of registered frames below which the result is rejected."""
+    min_frames: int = 5
+    """Number of registered frames below which the result is rejected (sets of fewer than 10 frames: 3)."""
+    min_points: int = 50
+    """Number of points below which a model is taken for an accident."""
+    min_angle_deg: float = 2.0
+    """Median triangulation angle below which a camera is taken to only turn on the spot."""
+    max_error_px: float = 2.0
+    """Mean reprojection error above which a model is rejected, px at max_image_size."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The models of one attempt and what is known of the largest."""
+
+    models: list[colmap.Model]
+    report: dict[str, Any]
+    objection: str | None
+    """Why the largest model cannot be used, or None."""
+
+    @property
+    def rank(self) -> tuple[bool, int, int]:
+        """Usable models first, then many frames, then many points."""
+        return self.objection is None, self.report["n_registered"], self.report["n_points"]
+
+
+def judge(models: list[colmap.Model], frames: list[Frame], config: CheckConfig, max_image_size: int) -> Outcome:
+    """Measure the largest model and say whether it can be a real one.
+
+    Args:
+        models: what one attempt found, largest first.
+        frames: the frames it was to register.
+        max_image_size: longer side, px, at which features were found.
+    """
+    n, model = len(frames), models[0] if models else None
+    registered = len(model.frames) if model else 0
+    points = model.n_points if model else 0
+    error = model.mean_error_px if model else 0.0
+    angle = median_triangulation_angle_deg(model) if model else 0.0
+    needed = max(3, min(config.min_frames, n // 2))
+    largest = max(max(frame.width, frame.height) for frame in frames)
+    limit = config.max_error_px * max(1.0, largest / max_image_size)
+    objection = None
+    if registered < max(needed, config.min_share * n):
+        objection = f"{'only ' if registered else 'nothing registers: '}{registered} of {n} frames" + (
+            " register" if registered else ""
+        )
+    elif points < config.min_points:
+        objection = f"only {points} points were triangulated from {registered} frames"
+    elif angle < config.min_angle_deg:
+        objection = f"the camera hardly moves: the median triangulation angle is {angle:.2f} degrees"
+    elif error > limit:
+        objection = f"the mean reprojection error is {error:.1f} px, more than {limit:.1f}"
+    report = {
+        "n_frames": n,
+        "n_registered": registered,
+        "registered_share": round(registered / n, 4),
+        "n_points": points,
+        "mean_error_px": round(error, 3),
+        "median_angle_deg": round(angle, 2),
+        "verdict": objection or "sensible",
+        "models": [len(other.frames) for other in models],
+    }
+    return Outcome(models, report, objection)
+
+
+def median_triangulation_angle_deg(model: colmap.Model) -> float:
+    """Median over the points of the largest angle between two of the rays that see it, degrees (0 without points)."""
+    points, cameras = model.points(), model.cameras()
+    if not len(points):
+        return 0.0
+    number = {frame: i for i, frame in enumerate(cameras)}
+    centres = np.stack([camera.centre for camera in cameras.values()])
+    rays = centres[[number[frame] for frame in points.frame]] - points.xyz[points.point_index]
+    rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
+    return float(np.median(_largest_angles_deg(rays, points.point_index, len(points))))
+
+
+def _largest_angles_deg(rays: Floats, group: NDArray[np.int64], n: int) -> Floats:
+    """Largest angle between two unit rays of the same group, for groups sorted and numbered 0 .. n - 1."""
+    lengths = np.bincount(group, minlength=n)
+    largest = np.zeros(n)
+    for shift in range(1, int(lengths.max(initial=0))):
+        first = np.flatnonzero(group[:-shift] == group[shift:])
+        # the chord keeps tiny angles that a cosine would lose
+        chord = np.linalg.norm(rays[first] - rays[first + shift], axis=1)
+        np.maximum.at(largest, group[first], np.degrees(2 * np.arcsin(np.minimum(chord / 2, 1))))
+    return largest
+
+
+def split_warning(models: list[colmap.Model]) -> list[str]:
+    """Other models that hold frames of their own: two objects in one folder, or a gap in the capture."""
+    sizes, known = [len(models[0].frames)], set(models[0].frames)
+    for model in models[1:]:
+        own = set(model.frames) - known
+        if len(own) >= 3:
+            sizes.append(len(model.frames))
+            known |= own
+    if len(sizes) == 1:
+        return []
+    listed = f"{', '.join(map(str, sizes[:-1]))} and {sizes[-1]}"
+    return [f"frames form {len(sizes)} separate models of {listed} frames; the largest is kept"]
