@@ -16,26 +16,26 @@ from pipeline.commands import app as prep
 app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode="rich",
-    help="""Dense object descriptors from plain videos, and recognition from one example.
+    help="""Dense object descriptors from plain videos, recognition from one example.
 
     [bold]The tour[/], from a folder of phone videos to a score:
 
-      dope prep colmap videos/ --out work       frames, cameras and depth
+      dope prep colmap videos/ --out work     frames, cameras and depth
 
-      dope prep masks work                      the object's mask in every frame
+      dope prep masks work                    the object in every frame
 
-      dope prep correspond work                 views, pairs, pixel correspondences
+      dope prep correspond work               views, pairs, pixel matches
 
-      dope prep shards work --out shards        WebDataset tars and an index
+      dope prep shards work --out shards      WebDataset tars and an index
 
-      dope train shards --out run               a network whose descriptors agree across views
+      dope train shards --out run             a network of descriptors
 
-      dope eval run shards                      low-shot accuracy, beside chance
+      dope eval run shards                    low-shot accuracy
 
-      dope figure run shards --out figures      the same colours on the same parts
+      dope figure run shards                  same parts, same colours
 
-    [bold]dope demo[/] does all of it on objects that it makes itself, in minutes. [bold]dope doctor[/] says what is
-    installed and what is missing.
+    [bold]dope demo[/] does all of it, in minutes, on objects that it makes itself.
+    [bold]dope doctor[/] says what is installed and what is missing.
     """,
 )
 app.add_typer(prep, name="prep")
