@@ -33,7 +33,7 @@ from pipeline.geometry import Camera, Floats
 CODECS = {"mp4": "mp4v", "mov": "mp4v", "avi": "MJPG", "mkv": "MJPG", "webm": "VP80"}
 """Containers and the codec that goes into each; all are in OpenCV's wheel."""
 
-RECIPE_VERSION = 1
+RECIPE_VERSION = 2
 """Raise it whenever the pictures change, so that finished films are made anew."""
 
 

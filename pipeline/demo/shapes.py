@@ -82,6 +82,7 @@ def bottle(rng: np.random.Generator) -> list[Part]:
     top = spline(
         [(r, body), (0.75 * r, body + 0.55 * shoulder), (thin, body + shoulder), (thin, body + shoulder + neck)], 24
     )
+    top[:, 0] = np.minimum(top[:, 0], r)  # the spline swells before a steep shoulder
     end, wide, high = body + shoulder + neck, thin * rng.uniform(1.15, 1.45), rng.uniform(0.35, 0.6)
     return [
         Part("body", lathe([(0, 0), (0.9, 0), *side])),
