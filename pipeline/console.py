@@ -75,9 +75,9 @@ def describe(row: StageResult) -> str:
         return row.reason or ""
     wanted = {
         "frames": "{kept} of {frames} frames kept",
-        "sfm": "{registered} of {frames} frames registered, {points} points, {reprojection_error_px:.2f} px",
-        "depth": "{frames} depth maps, {coverage:.0%} covered",
-        "masks": "{frames} masks, {source}",
+        "sfm": "{n_registered} of {n_frames} frames registered, {n_points} points, {mean_error_px:.2f} px, by {rung}",
+        "depth": "{coverage:.0%} of the pixels, {sparse_within_2_percent:.0%} within 2% of the points",
+        "masks": "{masks} masks from {from}, {missing} missing, {empty} empty",
         "correspond": "{pairs} pairs of {views} views, {median_correspondences:.0f} points a pair",
     }
     try:

@@ -124,7 +124,7 @@ def run_stage(
     result = StageResult(sequence.id, stage, "ok", fingerprint=mark, versions={"dope": dope.__version__})
     try:
         result.details = work()
-        if "empty" in result.details:
+        if isinstance(result.details.get("empty"), str):  # a number is a count of empty things
             result.status, result.reason = "empty", result.details.pop("empty")
     except DiskFull:
         raise

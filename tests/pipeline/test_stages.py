@@ -66,6 +66,7 @@ def test_failures_are_rows_with_reasons_and_are_kept(sequence: Sequence) -> None
 def test_empty_is_neither_ok_nor_failed(sequence: Sequence) -> None:
     row = run_stage(sequence, "correspond", Config(), "a", Work({"empty": "no pair"}))
     assert (row.status, row.reason, row.ok) == ("empty", "no pair", False)
+    assert run_stage(sequence, "masks", Config(), "a", Work({"empty": 0})).ok  # a count
 
 
 def test_a_full_disk_is_not_a_failure_of_the_item(sequence: Sequence) -> None:
