@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from dope.common.errors import BadInput
 from pipeline.depth_filter import AgreementConfig, confirmations, drop_islands, fuse, sample_pixels
 from pipeline.geometry import Floats, nearest_point_to_axes
-from pipeline.neighbours import NeighbourConfig, choose_neighbours
+from pipeline.neighbours import NeighbourConfig, choose_neighbours, sees
 from pipeline.sequence import Frame, Sequence, read_image
 from pipeline.stereo import Depth, View, stereo_depth
 
@@ -39,6 +39,10 @@ class DepthConfig:
     """Long side of the images that are matched, and of the depth maps; smaller images keep their size."""
     neighbours: NeighbourConfig = field(default_factory=NeighbourConfig)
     """Which views a view is matched with."""
+    witnesses: NeighbourConfig = field(
+        default_factory=lambda: NeighbourConfig(count=8, allowed_deg=(2.0, 40.0), min_baseline_deg=0.0)
+    )
+    """Which views may confirm its depth: more and farther ones than can be matched."""
     agreement: AgreementConfig = field(default_factory=AgreementConfig)
     """When a depth is believed."""
     min_track: int = 3
@@ -147,7 +151,8 @@ def load_view(sequence: Sequence, frame: Frame, tracks: Tracks, config: DepthCon
     size = max(1, round(frame.width * scale)), max(1, round(frame.height * scale))
     assert frame.image is not None  # registered frames have one
     gray = read_image(sequence.folder / frame.image, cv2.IMREAD_GRAYSCALE)
-    gray = gray if scale == 1 else cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+    if scale < 1:
+        gray = np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8)
     camera = frame.camera.resized(*size)
     points = tracks.seen_by(frame.frame)
     mask = sequence.read_mask(frame)
@@ -166,7 +171,9 @@ def sgbm_depth(
     sequence: Sequence, frames: list[Frame], views: list[View], tracks: Tracks, config: DepthConfig
 ) -> list[Depth | None]:
     """Depth from rectified pairs, fused within each view and confirmed by others; None = no usable neighbour."""
-    neighbours = choose_neighbours([view.camera for view in views], looked_at(views), config.neighbours)
+    cameras, targets = [view.camera for view in views], looked_at(views, object_centre(sequence, views))
+    neighbours = choose_neighbours(cameras, targets, config.neighbours)
+    witnesses_of = choose_neighbours(cameras, targets, config.witnesses)
     agreement = config.agreement
     estimates = [view_depth(views[i], [views[j] for j in near], agreement) for i, near in enumerate(neighbours)]
     witnesses = [
@@ -176,33 +183,35 @@ def sgbm_depth(
         for view, estimate in zip(views, estimates, strict=True)
     ]
     depths: list[Depth | None] = []
-    for view, estimate, near in zip(views, estimates, neighbours, strict=True):
+    for view, estimate, nearby in zip(views, estimates, witnesses_of, strict=True):
         if estimate is None:
             depths.append(None)
             continue
-        others = [(views[j].camera, witnesses[j]) for j in near]
+        others = [(views[j].camera, witnesses[j]) for j in nearby]
         confirming = confirmations(view.camera, estimate.depth, others, agreement.tolerance)
         believed = (confirming > 0) & (estimate.count + confirming >= agreement.min_support)
         depths.append(drop_islands(np.where(believed, estimate.depth, np.float32(0)), agreement.min_island_px))
     return depths
 
 
-def looked_at(views: list[View]) -> Floats:
-    """What each view looks at (F, 3): of the point where the optical axes meet, the depth; else its points' median.
+def object_centre(sequence: Sequence, views: list[View]) -> Floats:
+    """The middle (3,) of what was filmed: the origin of a normalised sequence, else where the optical axes meet."""
+    if sequence.read_info().unit == "object radius":
+        return np.zeros(3)
+    return nearest_point_to_axes([view.camera for view in views])
 
-    The axes' common point is the object that was filmed; the median of the points may lie on the background.
+
+def looked_at(views: list[View], centre: Floats) -> Floats:
+    """What each view looks at (F, 3): the object's centre where the view sees it, else the median of its points.
+
+    The median alone may lie on the background, from where the cameras seem closer together than they are.
     """
-    common = nearest_point_to_axes([view.camera for view in views])
     targets = np.full((len(views), 3), np.nan)
     for i, view in enumerate(views):
-        if not len(view.points):
-            continue
-        targets[i] = np.median(view.points, axis=0)
-        pixels, z = view.camera.project(common[None])
-        nearest, farthest = np.percentile(view.camera.project(view.points)[1], [2, 98])
-        inside = 0 <= pixels[0, 0] < view.camera.width and 0 <= pixels[0, 1] < view.camera.height
-        if view.region is None and inside and nearest <= z[0] <= farthest:
-            targets[i] = common
+        if sees(view.camera, centre):
+            targets[i] = centre
+        elif len(view.points):
+            targets[i] = np.median(view.points, axis=0)
     return targets
 
 

@@ -17,7 +17,7 @@ class NeighbourConfig:
     """Neighbours a view, fewer where fewer qualify."""
     preferred_deg: tuple[float, float] = (6.0, 12.0)
     """Angles that match well and still measure depth well; chosen first."""
-    allowed_deg: tuple[float, float] = (2.0, 25.0)
+    allowed_deg: tuple[float, float] = (2.0, 32.0)
     """Angles that are used where nothing better exists."""
     min_baseline_deg: float = 53.0
     """Skip a neighbour whose baseline lies nearer than this to the viewing direction (it moved forwards)."""
@@ -39,6 +39,13 @@ def choose_neighbours(cameras: list[Camera], targets: Floats, config: NeighbourC
     return [_neighbours_of(i, cameras, centres, np.asarray(targets[i]), config) for i in range(len(cameras))]
 
 
+def sees(camera: Camera, point: Floats) -> bool:
+    """Whether a point (3,) of the world falls inside the image, in front of the camera."""
+    pixels, depth = camera.project(point[None])
+    x, y = pixels[0]
+    return bool(depth[0] > 0 and 0 <= x < camera.width and 0 <= y < camera.height)
+
+
 def _neighbours_of(
     index: int, cameras: list[Camera], centres: Floats, target: Floats, config: NeighbourConfig
 ) -> list[int]:
@@ -52,7 +59,7 @@ def _neighbours_of(
     usable = (angles >= config.allowed_deg[0]) & (angles <= config.allowed_deg[1])
     usable &= forwards <= np.cos(np.radians(config.min_baseline_deg))
     usable[index] = False
-    candidates = [int(j) for j in np.flatnonzero(usable) if _sees(cameras[j], target)]
+    candidates = [int(j) for j in np.flatnonzero(usable) if sees(cameras[j], target)]
 
     low, high = config.preferred_deg
     penalty = 2 * np.abs(np.log(np.maximum(angles, 1e-6) / np.clip(angles, low, high)))
@@ -70,12 +77,6 @@ def _novelty(ray: Floats, taken: Floats, full_deg: float) -> float:
     if not len(taken):
         return 1.0
     return float(min(_angles_deg(taken, ray).min() / full_deg, 1.0))
-
-
-def _sees(camera: Camera, point: Floats) -> bool:
-    pixels, depth = camera.project(point[None])
-    x, y = pixels[0]
-    return bool(depth[0] > 0 and 0 <= x < camera.width and 0 <= y < camera.height)
 
 
 def _unit(vectors: Floats) -> Floats:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -91,7 +92,8 @@ class Rectification:
         R = self.R_second if second else self.R_first
         K = camera.K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # +0.5 is the centre of index 0
         size = (self.width, self.height)
-        return cv2.initUndistortRectifyMap(K, camera.distortion, R, P, size, cv2.CV_32FC1)
+        map_x, map_y = cv2.initUndistortRectifyMap(K, camera.distortion, R, P, size, cv2.CV_32FC1)
+        return np.asarray(map_x, np.float32), np.asarray(map_y, np.float32)
 
 
 def rectify(first: Camera, second: Camera, box: Box, points: Floats) -> Rectification | None:
@@ -164,12 +166,12 @@ def stereo_depth(first: View, second: View, box: Box) -> tuple[Depth, float] | N
     if pair is None:
         return None
     maps_second = pair.maps(second.camera, second=True)
-    left = cv2.remap(first.gray, *pair.maps(first.camera, second=False), cv2.INTER_LINEAR)
-    right = cv2.remap(second.gray, *maps_second, cv2.INTER_LINEAR)
+    left = _remap(first.gray, *pair.maps(first.camera, second=False), cv2.INTER_LINEAR)
+    right = _remap(second.gray, *maps_second, cv2.INTER_LINEAR)
     disparity = match(left, right, pair.levels)
 
     x0, y0, x1, y1 = box
-    rays = cv2.transform(pixel_rays(first.camera)[y0:y1, x0:x1], pair.R_first.astype(np.float32))
+    rays = np.asarray(cv2.transform(pixel_rays(first.camera)[y0:y1, x0:x1], pair.R_first), np.float32)
     cosine = rays[..., 2]
     u = rays[..., 0] / cosine * np.float32(pair.focal_px) + np.float32(pair.cx_first)
     v = rays[..., 1] / cosine * np.float32(pair.focal_px) + np.float32(pair.cy)
@@ -185,20 +187,20 @@ def stereo_depth(first: View, second: View, box: Box) -> tuple[Depth, float] | N
 
 def match(left: NDArray[np.uint8], right: NDArray[np.uint8], levels: int) -> Depth:
     """Sub-pixel disparity of the left of two rectified images (h, w); 0 = unknown (Hirschmueller, PAMI 2008)."""
-    matcher = cv2.StereoSGBM_create(
+    matcher = cv2.StereoSGBM.create(
         minDisparity=0,
         numDisparities=levels,
         blockSize=BLOCK,
         P1=8 * BLOCK**2,
-        P2=64 * BLOCK**2,
+        P2=128 * BLOCK**2,
         disp12MaxDiff=1,  # px, between matching left to right and right to left
         preFilterCap=31,
-        uniquenessRatio=0,  # what is ambiguous fails the agreement of neighbours, which costs less coverage
-        speckleWindowSize=80,  # px, smaller islands are dropped
-        speckleRange=1,
+        # ambiguous matches and speckles are left to the agreement between neighbours, which costs less coverage
+        uniquenessRatio=0,
+        speckleWindowSize=0,
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )
-    disparity = matcher.compute(left, right).astype(np.float32) / 16
+    disparity = matcher.compute(left, right).astype(np.float32) / np.float32(16)
     # the first and last level have no neighbour to interpolate with: the true match may lie beyond them
     disparity[(disparity < 0.5) | (disparity > levels - 1.5)] = 0
     return disparity
@@ -210,10 +212,15 @@ def sample_within_surfaces(values: Depth, u: Depth, v: Depth, tolerance: float |
     A sample whose four neighbours are not all known, or that differs from the nearest of them by more than
     `tolerance`, is unknown.
     """
-    bilinear = cv2.remap(values, u, v, cv2.INTER_LINEAR)
-    nearest = cv2.remap(values, u, v, cv2.INTER_NEAREST)
+    bilinear = _remap(values, u, v, cv2.INTER_LINEAR)
+    nearest = _remap(values, u, v, cv2.INTER_NEAREST)
     smooth = (nearest > 0) & (np.abs(bilinear - nearest) <= tolerance)
-    return np.where(smooth, bilinear, np.float32(0))
+    return np.where(smooth, bilinear, 0).astype(np.float32, copy=False)
+
+
+def _remap(values: NDArray[Any], u: Depth, v: Depth, interpolation: int) -> NDArray[Any]:
+    """`values` at array indices u, v; 0 outside."""
+    return np.asarray(cv2.remap(values, u, v, interpolation))
 
 
 @lru_cache(maxsize=8)
@@ -246,4 +253,4 @@ def _outline_rays(camera: Camera, box: Box) -> Floats:
 def _inside(maps: tuple[Depth, Depth], camera: Camera, u: Depth, v: Depth) -> NDArray[np.bool_]:
     """Whether rectified positions fall on the image and not on the black around it."""
     inside = (maps[0] >= 0) & (maps[0] <= camera.width - 1) & (maps[1] >= 0) & (maps[1] <= camera.height - 1)
-    return cv2.remap(inside.astype(np.uint8), u, v, cv2.INTER_NEAREST) > 0
+    return _remap(inside.astype(np.uint8), u, v, cv2.INTER_NEAREST) > 0
