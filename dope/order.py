@@ -61,10 +61,10 @@ class SampleOrder:
             )
         if self.n_objects < batch_size:
             logger.warning(
-                "%d objects fill a batch of %d only with several pairs of one object, which are no negatives of each "
-                "other; --set data.batch_size=%d avoids it",
-                self.n_objects, batch_size, max(2, self.n_objects),
-            )  # fmt: skip
+                "%d objects fill a batch of %d only with several pairs of one object, never contrasted with each other",
+                self.n_objects,
+                batch_size,
+            )
 
     def epoch(self, epoch: int) -> NDArray[np.int64]:
         """(steps_per_epoch, batch_size) sample rows; no object twice in a row where there are enough objects."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 from collections.abc import Mapping
@@ -34,9 +35,9 @@ class RunLog:
         from torch.utils.tensorboard import SummaryWriter
 
         self._path = run / METRICS
-        _forget_after(self._path, start)
+        _forget_after(self._path, start if start else -1)
         self._file = self._path.open("a", encoding="utf-8")
-        self._board = SummaryWriter(str(run / "tensorboard"), purge_step=start + 1 if start else None)
+        self._board = SummaryWriter(str(run / "tensorboard"), purge_step=start + 1 if start else 0)
         self._console = Console(stderr=True)
         self._progress: Progress | None = None
         if self._console.is_terminal:
@@ -68,7 +69,9 @@ class RunLog:
     def event(self, event: str, step: int, epoch: int, values: Mapping[str, Any]) -> None:
         """Append one line to metrics.jsonl, and the numbers among the values to TensorBoard."""
         line = {"event": event, "step": step, "epoch": epoch, **values}
-        self._file.write(json.dumps(line) + "\n")
+        # JSON has no NaN
+        whole = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in line.items()}
+        self._file.write(json.dumps(whole) + "\n")
         self._file.flush()
         if event in ("step", "validation"):
             for name, value in values.items():

@@ -120,6 +120,7 @@ class PairLoader:
     def __init__(
         self, dataset: PairDataset, rows: Iterable[list[int]], *, workers: int = 0, pin_memory: bool = False
     ) -> None:
+        self._folder = dataset.index.folder
         self._loader = DataLoader(
             _Explaining(dataset),
             batch_sampler=rows,
@@ -132,10 +133,20 @@ class PairLoader:
         )
 
     def __iter__(self) -> Iterator[PairBatch]:
-        for batch in self._loader:
-            if isinstance(batch, DopeError):
-                raise batch
-            yield batch
+        try:
+            for batch in self._loader:
+                if isinstance(batch, DopeError):
+                    raise batch
+                yield batch
+        except RuntimeError as error:
+            if "DataLoader worker" not in str(error):
+                raise
+            raise DopeError(
+                f"a process that decodes samples died ({error})",
+                where=self._folder,
+                remedy="Memory or shared memory ran out: use --set data.workers=1, or in a container give "
+                "more shared memory (docker run --shm-size=4g)",
+            ) from error
 
 
 class _Explaining(Dataset):

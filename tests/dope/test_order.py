@@ -84,7 +84,7 @@ def test_less_than_one_batch_is_an_error_that_names_both_settings() -> None:
 def test_several_pairs_an_object_make_up_for_few_objects(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
         assert SampleOrder(OBJECTS, 24, pairs_per_object=5).epoch(0).shape == (2, 24)
-    assert "data.batch_size=10" in caplog.text
+    assert "10 objects fill a batch of 24" in caplog.text
 
 
 def test_a_batch_that_ranks_cannot_share_is_an_error() -> None:

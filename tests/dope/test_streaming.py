@@ -15,7 +15,7 @@ import torch
 from tiny_shards import make_pair, write_shards
 from webdataset import TarWriter
 
-from dope.common.errors import BadInput
+from dope.common.errors import BadInput, DopeError
 from dope.shard_index import read_index, verify_hashes
 from dope.streaming import PairDataset, PairLoader, collate
 from dope.tar_samples import ShardReader, split_members
@@ -236,6 +236,13 @@ def test_an_image_that_cannot_be_decoded_is_named_by_shard_and_key(copy: Path, w
         list(PairLoader(dataset, [[2, 3]], workers=workers))
     assert str(index.shards[3]) in str(caught.value) and str(index.keys[3]) in str(caught.value)
     assert "Traceback" not in str(caught.value)
+
+
+def test_a_worker_that_is_killed_is_explained(shards: Path) -> None:
+    dataset = PairDataset(shards, "train", image_size=64)
+    dataset._reader.sample = lambda *_: os.kill(os.getpid(), 9)  # type: ignore[method-assign,assignment,return-value]
+    with pytest.raises(DopeError, match=r"process that decodes samples died .*data\.workers"):
+        list(PairLoader(dataset, [[0, 1]], workers=1))
 
 
 def test_pickled_correspondences_are_refused(tmp_path: Path) -> None:

@@ -185,6 +185,16 @@ def test_every_ablation_trains(shards: Path, pairs: str, negatives: str, predict
     assert (losses.report["mask"] > 0) == predict_mask
 
 
+def test_half_precision_gives_nearly_the_same_loss_and_full_gradients(shards: Path) -> None:
+    reports = []
+    for precision in ("fp32", "bf16"):
+        state, losses = one_step(shards, tiny(f"precision={precision}"))
+        losses.backward.backward()
+        assert all(p.grad is not None and p.grad.dtype == torch.float32 for p in state.network.parameters())
+        reports.append(losses.report["loss"])
+    assert reports[0] != reports[1] and reports[0] == pytest.approx(reports[1], rel=0.05)
+
+
 def test_pairs_without_valid_points_do_no_harm(shards: Path) -> None:
     config = tiny()
     batch = batch_of(shards, config)
