@@ -70,14 +70,21 @@ def run_demo(out: Path, *, workers: int = 0, tiny: bool = False) -> None:
     families = (*plan.films.training_families, *plan.films.novel_families)
     count = len(families) * plan.films.per_family
     say(f"filming {count} objects of {len(families)} families into {out / 'videos'}")
-    film_objects(out / "videos", plan.films, workers=workers)
+    filmed: list[str] = []
+
+    def film_is_there(name: str) -> None:
+        filmed.append(name)
+        if len(filmed) % 4 == 0 or len(filmed) == count:
+            say(f"[dim]{len(filmed)} of {count} films are there[/]")
+
+    film_objects(out / "videos", plan.films, workers=workers, progress=film_is_there)
 
     base = ("--workers", workers)
     for part, names in (("train", plan.films.training_families), ("novel", plan.films.novel_families)):
         videos, work = [out / "videos" / name for name in names], out / f"work-{part}"
         masks = out / "videos" / "masks"
         dope("prep", "colmap", *videos, "--category-from", "parent", "--masks", masks, "--out", work,
-             *base, *("--set", "frames.count=24"), allow_failed_items=True)  # fmt: skip
+             *base, *("--set", "frames.count=28"), allow_failed_items=True)  # fmt: skip
         dope("prep", "masks", work, *base, allow_failed_items=True)
         dope("prep", "correspond", work, "--every", 1, *base, allow_failed_items=True)
         holdout = ("--holdout", "frames") if part == "train" else ("--holdout", "none")
@@ -87,7 +94,7 @@ def run_demo(out: Path, *, workers: int = 0, tiny: bool = False) -> None:
     settings = [word for setting in plan.train for word in ("--set", setting)]
     dope("train", shards, "--out", run, "--preset", "nano", *settings)
     dope("eval", run, novel, "--ways", plan.ways, "--shots", 1, "--queries", plan.queries,
-         "--episodes", plan.episodes, "--out", run / "eval", "--compare-untrained")  # fmt: skip
+         "--episodes", plan.episodes, "--compare-untrained")  # fmt: skip
     dope("figure", run, shards, "--kind", "colouring", "--out", out / "figures")
     dope("figure", run, novel, "--kind", "colouring", "--out", out / "figures")
     dope("figure", run, novel, "--kind", "heatmap", "--out", out / "figures")
@@ -96,18 +103,19 @@ def run_demo(out: Path, *, workers: int = 0, tiny: bool = False) -> None:
 
 def _summary(console: Console, out: Path, seconds: float) -> None:
     console.rule("what came out")
-    validations = [
-        row for line in (out / "run" / "metrics.jsonl").read_text().splitlines() if "pck" in (row := json.loads(line))
-    ]
+    lines = (out / "run" / "metrics.jsonl").read_text().splitlines()
+    validations = [row for line in lines if (row := json.loads(line))["event"] == "validation"]
     if validations:
         first, last = validations[0], validations[-1]
-        console.print(f"  held-out PCK: {last['pck']:.1%} (untrained {first['pck']:.1%})")
-    result = files.read_json(out / "run" / "eval" / "result.json")
-    console.print(
-        f"  {result['ways']}-way {result['shots']}-shot on families never trained on: "
-        f"[bold]{result['accuracy']:.1%} ± {result['ci95']:.1%}[/]"
-        f" (untrained network {result['untrained_accuracy']:.1%}, chance {result['chance']:.1%})"
-    )
+        console.print(
+            f"  held-out views: the right pixel found for [bold]{last['pck']:.1%}[/] of the points "
+            f"(PCK; untrained network {first['pck']:.1%})"
+        )
+    for row in files.read_json(out / "run" / "eval" / "results.json"):
+        console.print(
+            f"  {row['ways']}-way {row['shots']}-shot on families never trained on, {row['network']} network: "
+            f"[bold]{row['accuracy']:.1%} ± {row['ci95']:.1%}[/] (chance {row['chance']:.1%})"
+        )
     console.print(f"  took {seconds / 60:.1f} minutes")
     console.rule("where to look")
     for path, what in (
