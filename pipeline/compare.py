@@ -37,10 +37,13 @@ def read_reference(path: Path) -> dict[str, Camera]:
     The file: OpenCV convention; `frames` with name, width, height, fx, fy, cx, cy, dist (k1, k2, p1, p2), w2c_R, w2c_t.
 
     Raises:
-        BadInput: a frame lacks a field, or has one of a wrong shape.
+        BadInput: not such a file; a frame lacks a field, or has one of a wrong shape.
     """
     cameras = {}
-    for number, row in enumerate(files.read_json(path)["frames"]):
+    content = files.read_json(path)
+    if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
+        raise BadInput("has no list of `frames`", where=path)
+    for number, row in enumerate(content["frames"]):
         try:
             K = np.array([[row["fx"], 0, row["cx"]], [0, row["fy"], row["cy"]], [0, 0, 1]], dtype=np.float64)
             distortion = np.zeros(4)

@@ -28,7 +28,10 @@ class CheckConfig:
     min_points: int = 50
     """Number of points below which a model is taken for an accident."""
     min_angle_deg: float = 2.0
-    """Median triangulation angle below which a camera is taken to only turn on the spot."""
+    """Median triangulation angle below which a camera is taken to stand still."""
+    min_parallax: float = 0.3
+    """Median triangulation angle over the angle by which cameras turned, below which a camera is taken to only turn.
+    Around an object, or along it, the ratio is 1 or more."""
     max_error_px: float = 2.0
     """Mean reprojection error above which a model is rejected, px at max_image_size."""
 
@@ -60,7 +63,7 @@ def judge(models: list[colmap.Model], frames: list[Frame], config: CheckConfig, 
     registered = len(model.frames) if model else 0
     points = model.n_points if model else 0
     error = model.mean_error_px if model else 0.0
-    angle = median_triangulation_angle_deg(model) if model else 0.0
+    angle, turn = median_angles_deg(model) if model else (0.0, 0.0)
     needed = max(3, min(config.min_frames, n // 2))
     largest = max(max(frame.width, frame.height) for frame in frames)
     limit = config.max_error_px * max(1.0, largest / max_image_size)
@@ -70,9 +73,9 @@ def judge(models: list[colmap.Model], frames: list[Frame], config: CheckConfig, 
             " register" if registered else ""
         )
     elif points < config.min_points:
-        objection = f"only {points} points were triangulated from {registered} frames"
-    elif angle < config.min_angle_deg:
-        objection = f"the camera hardly moves: the median triangulation angle is {angle:.2f} degrees"
+        objection = f"only {points} points were triangulated from {registered} frames: the camera hardly moves"
+    elif angle < max(config.min_angle_deg, config.min_parallax * turn):
+        objection = f"the camera hardly moves: it turns by {turn:.1f} degrees, and rays meet at only {angle:.1f}"
     elif error > limit:
         objection = f"the mean reprojection error is {error:.1f} px, more than {limit:.1f}"
     report = {
@@ -82,26 +85,33 @@ def judge(models: list[colmap.Model], frames: list[Frame], config: CheckConfig, 
         "n_points": points,
         "mean_error_px": round(error, 3),
         "median_angle_deg": round(angle, 2),
+        "median_turn_deg": round(turn, 2),
         "verdict": objection or "sensible",
         "models": [len(other.frames) for other in models],
     }
     return Outcome(models, report, objection)
 
 
-def median_triangulation_angle_deg(model: colmap.Model) -> float:
-    """Median over the points of the largest angle between two of the rays that see it, degrees (0 without points)."""
+def median_angles_deg(model: colmap.Model) -> tuple[float, float]:
+    """Medians over the points: the largest angle between two rays to a point, and between two cameras that see it.
+
+    The second is that of the viewing directions. Where a camera moves around what it looks at, the two are alike;
+    where it only turns, the rays stay together. Degrees, 0 without points.
+    """
     points, cameras = model.points(), model.cameras()
     if not len(points):
-        return 0.0
+        return 0.0, 0.0
     number = {frame: i for i, frame in enumerate(cameras)}
-    centres = np.stack([camera.centre for camera in cameras.values()])
-    rays = centres[[number[frame] for frame in points.frame]] - points.xyz[points.point_index]
+    view = np.array([number[frame] for frame in points.frame.tolist()])
+    rays = np.stack([camera.centre for camera in cameras.values()])[view] - points.xyz[points.point_index]
     rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
-    return float(np.median(_largest_angles_deg(rays, points.point_index, len(points))))
+    directions = np.stack([camera.direction for camera in cameras.values()])[view]
+    at_point, of_cameras = (largest_angles_deg(x, points.point_index, len(points)) for x in (rays, directions))
+    return float(np.median(at_point)), float(np.median(of_cameras))
 
 
-def _largest_angles_deg(rays: Floats, group: NDArray[np.int64], n: int) -> Floats:
-    """Largest angle between two unit rays of the same group, for groups sorted and numbered 0 .. n - 1."""
+def largest_angles_deg(rays: Floats, group: NDArray[np.int64], n: int) -> Floats:
+    """Largest angle between two unit vectors of the same group, for groups sorted and numbered 0 .. n - 1."""
     lengths = np.bincount(group, minlength=n)
     largest = np.zeros(n)
     for shift in range(1, int(lengths.max(initial=0))):

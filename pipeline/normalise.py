@@ -54,15 +54,15 @@ def find_object(points: Floats, cameras: list[Camera], masks: list[NDArray[np.bo
             return ObjectFrame(centre, radius, len(inside), "masks")
     centre, method = _looked_at(points, cameras)
     distance = float(np.median([np.linalg.norm(camera.centre - centre) for camera in cameras]))
-    near = points
+    near, target = points, centre
     for share in (0.7, 0.5, 0.5):
-        # the axes may miss the object's middle; its points pull the centre there, and the circle shrinks around it
         candidates = points[np.linalg.norm(points - centre, axis=1) < share * distance]
         if len(candidates) < MIN_POINTS:
             break
         near = candidates
-        centre = np.median(near, axis=0)
-    _, radius = _middle_and_radius(near)
+        # the axes may miss the object, and its seen surface lies to one side of its middle: halfway between them
+        centre = (target + np.median(near, axis=0)) / 2
+    radius = _radius(near, centre)
     radius = float(np.clip(radius, 0.05 * distance, 0.6 * distance)) if distance > 0 else radius
     return ObjectFrame(centre, radius, len(near), method)
 
@@ -86,7 +86,11 @@ def _middle_and_radius(points: Floats) -> tuple[Floats, float]:
     """Middle of the box that holds 96% of the points along each axis, and the distance that holds 95% of them."""
     low, high = np.percentile(points, [2, 98], axis=0)
     centre = (low + high) / 2
-    return centre, max(float(np.percentile(np.linalg.norm(points - centre, axis=1), 95)), 1e-9)
+    return centre, _radius(points, centre)
+
+
+def _radius(points: Floats, centre: Floats) -> float:
+    return max(float(np.percentile(np.linalg.norm(points - centre, axis=1), 95)), 1e-9)
 
 
 def _looked_at(points: Floats, cameras: list[Camera]) -> tuple[Floats, str]:

@@ -63,6 +63,8 @@ class SfmConfig:
     """The last attempt matches sets up to this size exhaustively."""
     target_share: float = 0.97
     """Share of registered frames (rounded down to whole frames) at which no further attempt is made."""
+    max_rungs: int = 3
+    """Rungs of the ladder tried: default, fine (finer scales, guided matching), large (more pixels, all pairs)."""
     checks: CheckConfig = field(default_factory=CheckConfig)
     """What a model must have to be believed."""
     threads: int = 1
@@ -158,7 +160,7 @@ def _usable(frames: list[Frame], config: SfmConfig, warnings: list[str], sequenc
 
 def _climb(sequence: Sequence, used: list[Frame], config: SfmConfig, scratch: Path) -> Iterator[Outcome]:
     """Attempt after attempt; the caller stops when it is content."""
-    for rung in LADDER:
+    for rung in LADDER[: config.max_rungs]:
         seconds, cpu = time.perf_counter(), cpu_seconds()
         database = scratch / f"{rung.name}.db"
         how = _match(sequence, used, config, rung, database, scratch)
@@ -303,7 +305,7 @@ def _seed(config: SfmConfig, *what: str) -> int:
 
 
 def _remedy(config: SfmConfig, objection: str) -> str:
-    if "triangulation angle" in objection:
+    if "hardly moves" in objection:
         advice = "Move the camera around the object instead of turning it on the spot"
     else:
         advice = "Take more views with more overlap, in sharp focus and good light"
