@@ -99,7 +99,7 @@ def compute_depth(sequence: Sequence, config: DepthConfig) -> dict[str, Any]:
             raise BadInput(
                 "PatchMatch needs a CUDA device and the pycolmap-cuda12 package",
                 where=sequence.folder,
-                remedy="Use --depth-backend sgbm",
+                remedy="Use `--set depth.backend=sgbm`",
             )
     return write_depths(sequence, tracks, config, sparse_depth if config.mode == "sparse" else sgbm_depth)
 
