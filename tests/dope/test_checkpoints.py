@@ -120,20 +120,21 @@ def text(path: Path) -> None:
 
 
 def code(path: Path) -> None:
-    path.write_bytes(pickle.dumps({"network": subprocess.Popen}))
+    path.write_bytes(pickle.dumps({"network": subprocess.Popen}, protocol=2))
 
 
 def other_dict(path: Path) -> None:
     torch.save({"weights": 1}, path)
 
 
-@pytest.mark.parametrize("damage", [truncate, flip, empty, text, code, other_dict])
-@pytest.mark.parametrize("with_hash", [True, False])
+# one flipped byte of a weight can only be found by the hash
+@pytest.mark.parametrize(
+    ("damage", "with_hash"),
+    [(flip, True), *((d, with_hash) for d in (truncate, empty, text, code, other_dict) for with_hash in (True, False))],
+)
 def test_damage_is_an_error_that_names_the_file_and_another_checkpoint(
     run: Path, damage: Callable[[Path], None], with_hash: bool
 ) -> None:
-    if damage is flip and not with_hash:
-        pytest.skip("one flipped byte of a weight can only be found by the hash")
     state = trained(steps=0)
     state.step = 9
     path = save_checkpoint(run, state, CONFIG, "shards")
@@ -156,7 +157,7 @@ def test_other_settings_are_refused_and_all_named(run: Path) -> None:
     with pytest.raises(UsageError) as caught:
         resume(run, new_state(other, ALONE), other, "shards")
     message = str(caught.value)
-    assert "momentum is 0.5, was 0.99" in message and "data.batch_size is 4, was 16" in message
+    assert "momentum is 0.5, was 0.99" in message and f"data.batch_size is 4, was {CONFIG.data.batch_size}" in message
     assert "workers" not in message and "--out" in message
 
 
