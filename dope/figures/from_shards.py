@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from dope.common.errors import BadInput, UsageError
 from dope.figures.colouring import Colours, correspondence_colouring
 from dope.figures.heatmap import Point, similarity_heatmap
-from dope.lowshot.evaluate import untrained_network
 from dope.lowshot.views import ViewShards
 from dope.networks import DopeNetwork, NetworkConfig
+from dope.networks.untrained import untrained_network
 
 Kind = Literal["colouring", "heatmap"]
 

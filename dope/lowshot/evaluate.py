@@ -16,13 +16,17 @@ from numpy.typing import NDArray
 from dope.common import settings
 from dope.common.errors import UsageError
 from dope.common.progress import Progress
-from dope.common.seeds import derive_seed
 from dope.lowshot.classifiers import Work, classify_by_centroid, classify_locally
+from dope.lowshot.encoding import to_tensor
 from dope.lowshot.episodes import EpisodeConfig, Episodes, Population, classes_of, sample_episodes
 from dope.lowshot.matching import MatchingConfig
 from dope.lowshot.results import ResultRow
 from dope.lowshot.views import ViewShards
 from dope.networks import DopeNetwork, NetworkConfig
+from dope.networks.untrained import settle_batchnorm, untrained_network
+
+SETTLING_VIEWS = 64
+"""Views from which a network of random weights gets its BatchNorm statistics."""
 
 
 @dataclass(frozen=True)
@@ -105,6 +109,8 @@ def evaluate(
     rows: list[ResultRow] = []
     accuracies: list[NDArray[np.float64]] = []
     for net, weights in networks:
+        if weights["network"] == "untrained":
+            settle_on(net, views, chosen, work)
         predictions = classify(net, episodes, work)
         for asked, population, drawn, predicted in zip(
             config.protocols, populations, episodes, predictions, strict=True
@@ -151,11 +157,11 @@ def _networks(
     return found, image_size
 
 
-def untrained_network(config: NetworkConfig, seed: int) -> DopeNetwork:
-    """A network in eval mode with random weights that are a function of the seed."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(derive_seed(seed, "untrained network"))
-        return DopeNetwork(config).eval()
+def settle_on(network: DopeNetwork, views: ViewShards, chosen: NDArray[np.int64], work: Work) -> None:
+    """Give a network of random weights the BatchNorm statistics of views spread over those that are evaluated."""
+    some = chosen[:: max(1, len(chosen) // SETTLING_VIEWS)][:SETTLING_VIEWS]
+    batches = views.batches(some, 32, image_size=work.image_size)  # not work.batch: results must not depend on it
+    settle_batchnorm(network, (to_tensor(images, work.device) for images in batches))
 
 
 def _population(views: ViewShards, chosen: NDArray[np.int64], protocol: EpisodeConfig) -> Population:

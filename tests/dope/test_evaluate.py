@@ -17,11 +17,12 @@ from torch import Tensor, nn
 from dope.common.errors import BadInput, UsageError
 from dope.lowshot.classifiers import Work, classify_by_centroid, classify_locally, nearest_centroid
 from dope.lowshot.episodes import EpisodeConfig, sample_episodes
-from dope.lowshot.evaluate import EvaluationConfig, evaluate, mean_and_ci95, untrained_network
+from dope.lowshot.evaluate import EvaluationConfig, evaluate, mean_and_ci95
 from dope.lowshot.matching import MatchingConfig
 from dope.lowshot.results import ResultRow, append_rows, read_rows, results_table
 from dope.lowshot.views import ViewShards
 from dope.networks import NetworkConfig, NetworkOutput
+from dope.networks.untrained import settle_batchnorm, untrained_network
 
 NETWORK = NetworkConfig(width=0.125, pyramid=16, projector=(24, 12))
 PROTOCOL = EpisodeConfig(ways=3, shots=1, queries=3, episodes=20)
@@ -154,6 +155,18 @@ def test_untrained_weights_are_a_function_of_the_seed_and_leave_the_global_state
     weights = [network.state_dict()["backbone.conv1.weight"] for network in (first, same, other)]
     assert torch.equal(weights[0], weights[1]) and not torch.equal(weights[0], weights[2])
     assert not first.training
+
+
+def test_settling_gives_batchnorm_the_statistics_of_the_images() -> None:
+    network = untrained_network(NETWORK, seed=0)
+    images = torch.rand(8, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    settle_batchnorm(network, [images])
+    x = network.backbone.conv1(images)
+    torch.testing.assert_close(network.backbone.bn1.running_mean, x.mean((0, 2, 3)), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(network.backbone.bn1.running_var, x.var((0, 2, 3)), rtol=1e-4, atol=1e-5)
+    assert network.backbone.bn1.momentum == 0.1 and not network.backbone.bn1.training
+    soft = network.masks(images).detach()
+    assert 0.05 < float(soft.mean()) < 0.95 and float(soft.std()) > 1e-3  # neither saturated nor constant
 
 
 def test_views_without_categories_are_explained(tmp_path: Path) -> None:

@@ -18,8 +18,8 @@ from dope.figures.drawing import MARK, Row, contact_sheet, dimmed, heat, over, p
 from dope.figures.from_shards import evenly_spaced
 from dope.figures.heatmap import similarity_heatmap
 from dope.figures.maps import describe
-from dope.lowshot.evaluate import untrained_network
 from dope.networks import DopeNetwork, NetworkConfig
+from dope.networks.untrained import untrained_network
 
 TURNS = (0, 30, -25)
 NETWORK = NetworkConfig(width=0.125, pyramid=16, projector=(24, 12))
