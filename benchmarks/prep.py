@@ -20,10 +20,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 
 from dope.common import files
 from pipeline.compare import compare_cameras, read_reference
-from pipeline.correspondences import read_pairs
 from pipeline.geometry import epipolar_distance_px, fundamental
 from pipeline.sequence import Sequence
 from pipeline.stages import read_marker
@@ -64,10 +64,11 @@ def cameras(captures: Path, work: Path) -> None:
         n_source = sum(1 for path in (captures / name / "images").iterdir() if not path.name.startswith("."))
         say(
             "cameras",
-            {"registered": errors.registered, "frames": n_source},
+            {"registered": errors.n_registered, "frames": n_source},
             capture=name,
-            neighbour_rotation_median_deg=round(errors.neighbour_rotation_median_deg, 4),
-            neighbour_rotation_max_deg=round(errors.neighbour_rotation_max_deg, 4),
+            neighbour_rotation_median_deg=round(errors.relative_rotation_median_deg, 4),
+            neighbour_rotation_max_deg=round(errors.relative_rotation_max_deg, 4),
+            translation_median_percent=round(errors.translation_median_percent, 3),
         )
 
 
@@ -91,13 +92,14 @@ def correspondences(captures: Path, work: Path, name: str = "mold_gold_cape") ->
     frames = {frame.frame: frame for frame in sequence.read_frames()}
     views = {row["frame"]: row for row in read_views(sequence)}
     distances, enough, total = [], 0, 0
-    for row in read_pairs(sequence):
+    for row in pq.read_table(sequence.correspondences).to_pylist():
+        matches = np.array(row["points"], dtype=np.float64).reshape(-1, 4)
         one, two = frames[row["frame1"]], frames[row["frame2"]]
-        cameras = [reference[frame.source_name] for frame in (one, two)]
+        cameras = [reference[Path(frame.source_name).stem] for frame in (one, two)]
         total += 1
         enough += row["n_correspondences"] >= 32
         normal = []
-        for frame, camera, points in ((one, cameras[0], row["points"][:, :2]), (two, cameras[1], row["points"][:, 2:])):
+        for frame, camera, points in ((one, cameras[0], matches[:, :2]), (two, cameras[1], matches[:, 2:])):
             pixels = view_to_source_pixels(views[frame.frame], frame, points)
             pixels = pixels * [camera.width / frame.width, camera.height / frame.height]
             normal.append(camera.to_normalised(pixels) * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2])

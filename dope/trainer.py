@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,12 +11,14 @@ from typing import Any
 import yaml
 
 from dope import checkpoints
+from dope.augmentation import no_augmentation
 from dope.batch import PairBatch
 from dope.common import files, settings
 from dope.common.errors import DopeError, UsageError
 from dope.config import TrainConfig, check
 from dope.distributed import Ranks, ranks_of
 from dope.heap import keep_heap
+from dope.networks.untrained import settle_batchnorm
 from dope.order import SampleOrder
 from dope.run_logging import Meter, RunLog, SilentLog
 from dope.state import TrainState, learning_rate, new_state, total_steps, wrap
@@ -135,8 +138,13 @@ class Run:
         """PCK and mask IoU on all ranks' held-out pairs, logged and kept for the checkpoint."""
         if self.config.validation.every == 0:
             return
-        self.ranks.copy_from_first(self.state.network)  # the ranks' BatchNorm statistics differ by their last batch
-        result = pck(self.state.network, self.held_out, points=self.config.data.points, ranks=self.ranks)
+        network = self.state.network
+        if self.state.step == 0:  # random weights without the statistics of real images would be no baseline at all
+            network = copy.deepcopy(network)
+            images = (no_augmentation(batch.to(self.ranks.device)).images1 for batch in self.held_out)
+            settle_batchnorm(network, images)
+        self.ranks.copy_from_first(network)  # the ranks' BatchNorm statistics differ by their last batch
+        result = pck(network, self.held_out, points=self.config.data.points, ranks=self.ranks)
         if result["pairs"] > 0:
             self.state.validation = result
             log.event("validation", self.state.step, self.state.place.epoch, result)
