@@ -257,6 +257,35 @@ def read_verified_pairs(database: Path) -> list[tuple[str, str, int]]:
     return sorted((name[a], name[b], int(n)) for (a, b), n in zip(pairs, counts, strict=True) if n)
 
 
+@dataclass(frozen=True)
+class MatchedPair:
+    """All matches of two images that share a two-view geometry.
+
+    Attributes:
+        first_px, second_px: (N, 2) positions in the two images.
+        verified: (N,) bool, True where the match agrees with the geometry.
+    """
+
+    first_px: NDArray[np.float32]
+    second_px: NDArray[np.float32]
+    verified: NDArray[np.bool_]
+
+
+def read_matched_pairs(database: Path) -> Iterator[MatchedPair]:
+    """The matches of all verified pairs, in the order of the images' ids."""
+    with _open(database) as db:
+        pixels = {image.image_id: db.read_keypoints(image.image_id)[:, :2] for image in db.read_all_images()}
+        for pair_id, number in zip(*db.read_two_view_geometry_num_inliers(), strict=True):
+            if not number:
+                continue
+            a, b = pycolmap.pair_id_to_image_pair(pair_id)
+            matches = np.asarray(db.read_matches(a, b), dtype=np.int64).reshape(-1, 2)
+            inliers = np.asarray(db.read_two_view_geometry(a, b).inlier_matches, dtype=np.int64).reshape(-1, 2)
+            width = len(pixels[b]) + 1
+            verified = np.isin(matches @ [width, 1], inliers @ [width, 1])
+            yield MatchedPair(pixels[a][matches[:, 0]], pixels[b][matches[:, 1]], verified)
+
+
 def map_incrementally(
     database: Path,
     images: Path,
@@ -332,14 +361,6 @@ def patch_match(workspace: Path, *, gpu: int = 0, max_image_size: int = -1, geom
     options = pycolmap.PatchMatchOptions(gpu_index=str(gpu), max_image_size=max_image_size, geom_consistency=geometric)
     with _explained("PatchMatch stereo failed", workspace):
         pycolmap.patch_match_stereo(workspace, options=options)
-
-
-def fuse(workspace: Path, output: Path, *, geometric: bool = True, min_pixels: int = 5, threads: int = -1) -> None:
-    """Fuse depth and normal maps of a dense workspace into one point cloud (PLY). Works without a GPU."""
-    options = pycolmap.StereoFusionOptions(min_num_pixels=min_pixels, num_threads=threads)
-    kind = "geometric" if geometric else "photometric"
-    with _explained("depth maps could not be fused", workspace):
-        pycolmap.stereo_fusion(output, workspace, input_type=kind, options=options, output_type="PLY")
 
 
 _CPU = pycolmap.Device.cpu

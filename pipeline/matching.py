@@ -8,6 +8,8 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.colmap import MatchedPair
+
 Pair = tuple[int, int]
 """Positions of two frames, the smaller first."""
 
@@ -87,3 +89,25 @@ def largest_component(n: int, pairs: Iterable[Pair]) -> int:
     for first, second in pairs:
         parent[root(first)] = root(second)
     return int(np.bincount([root(node) for node in range(n)]).max(initial=0)) if n else 0
+
+
+def second_motion_share(pairs: Iterable[MatchedPair], size_px: float) -> float:
+    """Share of image pairs that show two motions: one geometry, and matches against it that move together.
+
+    In a still scene, matches that break the geometry of two views are errors and point anywhere. Behind a turntable
+    stands a background that has another motion, often none: its matches share one shift.
+
+    Args:
+        pairs: verified pairs with all their matches.
+        size_px: longer side of the images; a shift is shared within 0.4% of it.
+    """
+    double = []
+    for pair in pairs:
+        shift = (pair.second_px - pair.first_px)[~pair.verified]
+        shift = shift[:: -(-len(shift) // 500) or 1]  # a sample is enough, and the table of all pairs stays small
+        together = 0
+        if len(shift):
+            apart = np.linalg.norm(shift[:, None] - shift[None], axis=-1)
+            together = int((apart < 0.004 * size_px).sum(axis=1).max())
+        double.append(together >= 10 and together > 0.1 * len(pair.verified))
+    return float(np.mean(double)) if double else 0.0

@@ -32,6 +32,8 @@ class CheckConfig:
     min_parallax: float = 0.3
     """Median triangulation angle over the angle by which cameras turned, below which a camera is taken to only turn.
     Around an object, or along it, the ratio is 1 or more."""
+    max_second_motion: float = 0.08
+    """Share of image pairs with two motions above which a part of the picture must move by itself (1 = allow)."""
     max_error_px: float = 2.0
     """Mean reprojection error above which a model is rejected, px at max_image_size."""
 
@@ -46,18 +48,26 @@ class Outcome:
     """Why the largest model cannot be used, or None."""
 
     @property
+    def two_motions(self) -> bool:
+        """True where a part of the picture moves by itself: further attempts at the same pixels are in vain."""
+        return bool(self.report["verdict"].endswith("moves by itself"))
+
+    @property
     def rank(self) -> tuple[bool, int, int]:
         """Usable models first, then many frames, then many points."""
         return self.objection is None, self.report["n_registered"], self.report["n_points"]
 
 
-def judge(models: list[colmap.Model], frames: list[Frame], config: CheckConfig, max_image_size: int) -> Outcome:
+def judge(
+    models: list[colmap.Model], frames: list[Frame], config: CheckConfig, max_image_size: int, motion: float
+) -> Outcome:
     """Measure the largest model and say whether it can be a real one.
 
     Args:
         models: what one attempt found, largest first.
         frames: the frames it was to register.
         max_image_size: longer side, px, at which features were found.
+        motion: share of the matched pairs that show two motions.
     """
     n, model = len(frames), models[0] if models else None
     registered = len(model.frames) if model else 0
@@ -68,7 +78,9 @@ def judge(models: list[colmap.Model], frames: list[Frame], config: CheckConfig, 
     largest = max(max(frame.width, frame.height) for frame in frames)
     limit = config.max_error_px * max(1.0, largest / max_image_size)
     objection = None
-    if registered < max(needed, config.min_share * n):
+    if motion > config.max_second_motion:
+        objection = f"in {motion:.0%} of the pairs of frames a part of the picture moves by itself"
+    elif registered < max(needed, config.min_share * n):
         objection = f"{'only ' if registered else 'nothing registers: '}{registered} of {n} frames" + (
             " register" if registered else ""
         )
@@ -86,6 +98,7 @@ def judge(models: list[colmap.Model], frames: list[Frame], config: CheckConfig, 
         "mean_error_px": round(error, 3),
         "median_angle_deg": round(angle, 2),
         "median_turn_deg": round(turn, 2),
+        "second_motion": round(motion, 4),
         "verdict": objection or "sensible",
         "models": [len(other.frames) for other in models],
     }

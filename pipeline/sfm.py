@@ -26,6 +26,8 @@ from pipeline.normalise import find_object
 from pipeline.sequence import Frame, Sequence
 from pipeline.stages import cpu_seconds
 
+MIN_FRAMES = 3
+
 
 @dataclass(frozen=True)
 class SfmConfig:
@@ -34,7 +36,8 @@ class SfmConfig:
     matching: Literal["auto", "sequential", "exhaustive", "similar"] = "auto"
     """Which frames are matched: neighbours in time, all, or those that look alike; auto chooses by order and number."""
     mask_features: bool = False
-    """Use only features inside the masks (turntables: the object turns, the background does not)."""
+    """Use only features inside the masks, where there are any (turntables: the object turns, the background does not).
+    Without this they are used all the same when whole images give no model that can be believed."""
     camera_model: colmap.CameraModel = "SIMPLE_RADIAL"
     """COLMAP's camera model."""
     share_camera: bool = True
@@ -105,14 +108,22 @@ def reconstruct(sequence: Sequence, config: SfmConfig) -> dict[str, Any]:
     """
     frames = sequence.read_frames()
     warnings: list[str] = []
-    used = _usable(frames, config, warnings, sequence)
-    outcomes: list[Outcome] = []
+    used = [frame for frame in frames if frame.image is not None]
+    masked = [frame for frame in used if frame.mask is not None]
+    if len(masked) < MIN_FRAMES:
+        if config.mask_features:
+            warnings.append(f"mask_features: {len(masked)} frames have a mask, whole images were used")
+        masked = []
     with _scratch(sequence) as scratch:
-        for outcome in _climb(sequence, used, config, scratch):
-            outcomes.append(outcome)
-            enough = int(config.target_share * len(used))  # rounded down: one frame of twenty may be missing
-            if outcome.objection is None and outcome.report["n_registered"] >= enough:
-                break
+        outcomes: list[Outcome] = []
+        if not (config.mask_features and masked):
+            outcomes = _climb(sequence, used, config, scratch / "whole", masked=False)
+        if masked and all(outcome.objection for outcome in outcomes):
+            if outcomes:
+                warnings.append(f"only features inside the masks were used: with all, {outcomes[-1].objection}")
+            if len(masked) < len(used):
+                warnings.append(f"{len(used) - len(masked)} frames without a mask were left out")
+            outcomes += _climb(sequence, masked, config, scratch / "masked", masked=True)
     best = max(outcomes, key=lambda outcome: outcome.rank)
     attempts = [outcome.report for outcome in outcomes]
     if best.objection is not None:
@@ -139,61 +150,66 @@ def reconstruct(sequence: Sequence, config: SfmConfig) -> dict[str, Any]:
     }
 
 
-def _usable(frames: list[Frame], config: SfmConfig, warnings: list[str], sequence: Sequence) -> list[Frame]:
-    """The frames to reconstruct from. Raises `BadInput` for fewer than three."""
-    used = [frame for frame in frames if frame.image is not None]
-    if config.mask_features:
-        masked = [frame for frame in used if frame.mask is not None]
-        if not masked:
-            warnings.append("mask_features: no frame has a mask, whole images were used")
-        elif len(masked) < len(used):
-            warnings.append(f"mask_features: {len(used) - len(masked)} frames without a mask were left out")
-        used = masked or used
-    if len(used) < 3:
+def _climb(sequence: Sequence, used: list[Frame], config: SfmConfig, scratch: Path, *, masked: bool) -> list[Outcome]:
+    """Attempt after attempt, until one is good enough or no further one can help."""
+    if len(used) < MIN_FRAMES:
         raise BadInput(
-            f"{len(used)} usable frames; a reconstruction needs at least 3",
+            f"{len(used)} usable frames; a reconstruction needs at least {MIN_FRAMES}",
             where=sequence.folder,
             remedy="Take more views, or keep more frames of the video",
         )
-    return used
-
-
-def _climb(sequence: Sequence, used: list[Frame], config: SfmConfig, scratch: Path) -> Iterator[Outcome]:
-    """Attempt after attempt; the caller stops when it is content."""
+    scratch.mkdir()
+    enough = int(config.target_share * len(used))  # rounded down: one frame of twenty may be missing
+    outcomes: list[Outcome] = []
     for rung in LADDER[: config.max_rungs]:
-        seconds, cpu = time.perf_counter(), cpu_seconds()
-        database = scratch / f"{rung.name}.db"
-        how = _match(sequence, used, config, rung, database, scratch)
-        verified = colmap.read_verified_pairs(database)
-        position = {_name(frame): i for i, frame in enumerate(used)}
-        graph = matching.largest_component(len(used), [(position[a], position[b]) for a, b, _ in verified])
-        for mapper in ("strict", "relaxed"):
-            models: list[colmap.Model] = []
-            if graph >= 2:
-                models = colmap.map_incrementally(
-                    database,
-                    sequence.images,
-                    scratch / f"{rung.name}.{mapper}",
-                    relaxed=mapper == "relaxed",
-                    min_model_size=3,
-                    refine_focal=config.refine_focal,
-                    seed=_seed(config, rung.name, mapper),
-                    threads=config.threads,
-                )
-            outcome = judge(models, used, config.checks, int(how["max_image_size"]))
-            outcome.report.update(
-                {"rung": rung.name, "mapper": mapper, **how, "n_verified_pairs": len(verified), "connected": graph}
+        for outcome in _attempts(sequence, used, config, rung, scratch, masked=masked):
+            outcomes.append(outcome)
+            if outcome.two_motions or (outcome.objection is None and outcome.report["n_registered"] >= enough):
+                return outcomes
+    return outcomes
+
+
+def _attempts(
+    sequence: Sequence, used: list[Frame], config: SfmConfig, rung: Rung, scratch: Path, *, masked: bool
+) -> Iterator[Outcome]:
+    """Features and matches of a rung, mapped strictly and then in a relaxed way."""
+    seconds, cpu = time.perf_counter(), cpu_seconds()
+    database = scratch / f"{rung.name}.db"
+    how = _match(
+        sequence, used, config, rung, database, masks=_mask_folder(sequence, used, scratch) if masked else None
+    )
+    verified = colmap.read_verified_pairs(database)
+    position = {_name(frame): i for i, frame in enumerate(used)}
+    graph = matching.largest_component(len(used), [(position[a], position[b]) for a, b, _ in verified])
+    size = max(max(frame.width, frame.height) for frame in used)
+    motion = matching.second_motion_share(colmap.read_matched_pairs(database), size)
+    for mapper in ("strict", "relaxed"):
+        models: list[colmap.Model] = []
+        if graph >= 2 and motion <= config.checks.max_second_motion:
+            models = colmap.map_incrementally(
+                database,
+                sequence.images,
+                scratch / f"{rung.name}.{mapper}",
+                relaxed=mapper == "relaxed",
+                min_model_size=3,
+                refine_focal=config.refine_focal,
+                seed=_seed(config, rung.name, mapper),
+                threads=config.threads,
             )
-            outcome.report["seconds"] = round(time.perf_counter() - seconds, 2)
-            outcome.report["cpu_seconds"] = round(cpu_seconds() - cpu, 2)
-            yield outcome
-            seconds, cpu = time.perf_counter(), cpu_seconds()
-            if graph <= outcome.report["n_registered"]:
-                break  # a relaxed mapper cannot cross a gap without matches
+        outcome = judge(models, used, config.checks, int(how["max_image_size"]), motion)
+        outcome.report.update(
+            {"rung": rung.name, "mapper": mapper, **how, "n_verified_pairs": len(verified), "connected": graph}
+        )
+        outcome.report["seconds"] = round(time.perf_counter() - seconds, 2)
+        outcome.report["cpu_seconds"] = round(cpu_seconds() - cpu, 2)
+        yield outcome
+        seconds, cpu = time.perf_counter(), cpu_seconds()
+        if graph <= outcome.report["n_registered"]:
+            break  # a relaxed mapper cannot cross a gap without matches
 
 
 def _match(
-    sequence: Sequence, used: list[Frame], config: SfmConfig, rung: Rung, database: Path, scratch: Path
+    sequence: Sequence, used: list[Frame], config: SfmConfig, rung: Rung, database: Path, *, masks: Path | None
 ) -> dict[str, Any]:
     """Features and verified matches of one rung in a new database; returns the settings that were used."""
     names = [_name(frame) for frame in used]
@@ -207,7 +223,6 @@ def _match(
         "first_octave": config.first_octave if rung.first_octave is None else rung.first_octave,
         "max_features": config.max_features,
     }
-    masks = _mask_folder(sequence, used, scratch) if config.mask_features and used[0].mask is not None else None
     colmap.extract_features(database, sequence.images, names, masks=masks, threads=config.threads, **settings)
     matched, pairs = _choose_pairs(sequence, database, names, config, rung)
     colmap.match_pairs(
@@ -305,12 +320,11 @@ def _seed(config: SfmConfig, *what: str) -> int:
 
 
 def _remedy(config: SfmConfig, objection: str) -> str:
+    masks = "if the object turns before a still background, give masks and --mask-features"
+    if "moves by itself" in objection:
+        return f"{masks[0].upper()}{masks[1:]}; if all is still, set sfm.checks.max_second_motion=1"
     if "hardly moves" in objection:
         advice = "Move the camera around the object instead of turning it on the spot"
     else:
         advice = "Take more views with more overlap, in sharp focus and good light"
-    return (
-        advice
-        if config.mask_features
-        else f"{advice}; if the object turns before a still background, give masks and --mask-features"
-    )
+    return advice if config.mask_features else f"{advice}; {masks}"

@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline import matching
+from pipeline.colmap import MatchedPair
 
 
 def test_neighbours_with_and_without_wrapping_around():
@@ -47,3 +48,16 @@ def test_largest_component():
     assert matching.largest_component(6, [(0, 1), (1, 2), (4, 5)]) == 3
     assert matching.largest_component(3, []) == 1
     assert matching.largest_component(0, []) == 0
+
+
+def test_matches_that_move_together_against_the_geometry_are_a_second_motion():
+    rng = np.random.default_rng(3)
+
+    def pair(n_still: int) -> MatchedPair:
+        first = rng.uniform(0, 640, (200, 2)).astype(np.float32)
+        second = rng.uniform(0, 640, (200, 2)).astype(np.float32)  # 60 random errors among 200 matches
+        second[:n_still] = first[:n_still] + np.float32(2)
+        return MatchedPair(first, second, np.arange(200) >= 60)
+
+    assert matching.second_motion_share([pair(0), pair(5), pair(40), pair(50)], 640) == 0.5
+    assert matching.second_motion_share([], 640) == 0
