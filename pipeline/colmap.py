@@ -200,18 +200,17 @@ def extract_features(
 
 
 def read_features(database: Path) -> dict[str, tuple[NDArray[np.float32], NDArray[np.uint8]]]:
-    """Name -> keypoints (N, 4: x, y, scale, angle) and SIFT descriptors (N, 128)."""
+    """Name -> scales (N,) and SIFT descriptors (N, 128) of each image's features."""
     result = {}
     with _open(database) as db:
         for image in db.read_all_images():
-            xy, rows = db.read_keypoints(image.image_id), np.zeros((0, 128), np.uint8)
-            keypoints = np.zeros((0, 4), np.float32)
-            if len(xy):
-                a11, a12, a21, a22 = xy[:, 2:6].T
-                scale, angle = np.sqrt(np.abs(a11 * a22 - a12 * a21)), np.arctan2(a21, a11)
-                keypoints = np.stack([xy[:, 0], xy[:, 1], scale, angle], axis=1)
-                rows = np.asarray(db.read_descriptors(image.image_id).data, dtype=np.uint8)
-            result[image.name] = (keypoints, rows)
+            keypoints = db.read_keypoints(image.image_id)
+            if not len(keypoints):
+                result[image.name] = (np.zeros(0, np.float32), np.zeros((0, 128), np.uint8))
+                continue
+            a11, a12, a21, a22 = keypoints[:, 2:6].T  # x and y come first, then the affine shape
+            descriptors = np.asarray(db.read_descriptors(image.image_id).data, dtype=np.uint8)
+            result[image.name] = (np.sqrt(np.abs(a11 * a22 - a12 * a21)), descriptors)
     return result
 
 

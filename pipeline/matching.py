@@ -41,14 +41,14 @@ def similarity_votes(
     8-bit descriptors are whole numbers below 2^24, exact in float32: the result does not depend on the BLAS.
 
     Args:
-        features: for each image keypoints (N, 4: x, y, scale, angle) and descriptors (N, 128).
+        features: for each image the scales (N,) and descriptors (N, 128) of its features.
 
     Returns:
         symmetric (n, n) counts, 0 on the diagonal.
     """
     largest = []
-    for keypoints, descriptors in features:
-        order = np.argsort(-keypoints[:, 2], kind="stable")[:n_features]
+    for scales, descriptors in features:
+        order = np.argsort(-scales, kind="stable")[:n_features]
         largest.append(descriptors[order].astype(np.float32))
     votes = np.zeros((len(features), len(features)), dtype=np.int64)
     for i, j in exhaustive_pairs(len(features)):

@@ -28,10 +28,9 @@ def test_images_that_share_features_find_each_other():
         rows = unit(100)
         if image in (0, 2):  # these two see the same 40 things, at the largest scales
             rows[:40] = np.clip(common + rng.normal(size=common.shape) * 3, 0, 255)
-        scales = np.where(np.arange(100) < 40, 9.0, 2.0)
-        keypoints = np.stack([np.zeros(100), np.zeros(100), scales, np.zeros(100)], axis=1).astype(np.float32)
+        scales = np.where(np.arange(100) < 40, 9.0, 2.0).astype(np.float32)
         order = rng.permutation(100)
-        features.append((keypoints[order], np.rint(rows).clip(0, 255).astype(np.uint8)[order]))
+        features.append((scales[order], np.rint(rows).clip(0, 255).astype(np.uint8)[order]))
     votes = matching.similarity_votes(features, n_features=60)
     assert votes[0, 2] == votes[2, 0] >= 36
     assert votes.sum() - 2 * votes[0, 2] <= 8 and not votes.diagonal().any()
@@ -39,7 +38,7 @@ def test_images_that_share_features_find_each_other():
 
 
 def test_an_image_without_features_is_no_ones_neighbour():
-    empty = (np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8))
+    empty = (np.zeros(0, np.float32), np.zeros((0, 128), np.uint8))
     votes = matching.similarity_votes([empty] * 3, n_features=60)
     assert not votes.any() and matching.most_similar_pairs(votes, 2) == []
 
