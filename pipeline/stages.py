@@ -8,6 +8,7 @@ not run again; the fingerprint of a stage is an input of the next, so a change t
 from __future__ import annotations
 
 import resource
+import shutil
 import sys
 import time
 import traceback
@@ -29,6 +30,9 @@ LATER_STAGES = {
     "correspond": (),
 }
 """What must be done again after a stage was run: their markers are removed before it starts."""
+
+FULL_BYTES = 8 << 20
+"""A disk with less room than this is full: a failure on it is the disk's."""
 
 Status = Literal["ok", "empty", "failed"]
 
@@ -133,6 +137,13 @@ def run_stage(
     except Exception as error:  # one bad item never stops the rest: it becomes a row with its traceback
         result.status, result.reason = "failed", f"{type(error).__name__}: {error}"
         result.trace = traceback.format_exc(limit=-8)
+    if result.status == "failed" and shutil.disk_usage(sequence.folder).free < FULL_BYTES:
+        # COLMAP and SQLite report a full disk in words of their own; it is no fault of this item
+        raise DiskFull(
+            f"no space left on the disk (stage '{stage}' says: {result.reason})",
+            where=sequence.folder,
+            remedy="Free some space or choose another --out, then run the same command again",
+        )
     result.seconds = round(time.perf_counter() - start, 3)
     result.cpu_seconds = round(cpu_seconds() - cpu, 3)
     result.peak_memory_mib = round(peak_memory_mib(), 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import pytest
 
@@ -73,6 +74,13 @@ def test_a_full_disk_is_not_a_failure_of_the_item(sequence: Sequence) -> None:
     with pytest.raises(DiskFull):
         run_stage(sequence, "sfm", Config(), "a", Work(DiskFull("full")))
     assert read_marker(sequence, "sfm") is None
+
+
+def test_a_failure_on_a_full_disk_is_the_disks(sequence: Sequence, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stages.shutil, "disk_usage", lambda _: SimpleNamespace(free=4096))
+    with pytest.raises(DiskFull, match="database or disk is full"):
+        run_stage(sequence, "sfm", Config(), "a", Work(RuntimeError("database or disk is full")))
+    assert read_marker(sequence, "sfm") is None  # it is run again as soon as there is room
 
 
 def test_an_interrupted_stage_leaves_no_marker(sequence: Sequence) -> None:
