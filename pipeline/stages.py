@@ -137,6 +137,7 @@ def run_stage(
     except Exception as error:  # one bad item never stops the rest: it becomes a row with its traceback
         result.status, result.reason = "failed", f"{type(error).__name__}: {error}"
         result.trace = traceback.format_exc(limit=-8)
+    sequence.folder.mkdir(parents=True, exist_ok=True)
     if result.status == "failed" and shutil.disk_usage(sequence.folder).free < FULL_BYTES:
         # COLMAP and SQLite report a full disk in words of their own; it is no fault of this item
         raise DiskFull(
