@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from dope.common import seeds
 from pipeline.geometry import Camera
 
-
 GIVE_UP = 100  # pairs of one range of angle that fail in a row: the views of long videos make thousands of the kind
 
 

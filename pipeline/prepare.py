@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from dope.common.errors import BadInput, DiskFull, DopeError
 from pipeline import stages
@@ -47,14 +47,27 @@ class RunOptions:
     retry_failed: bool = False
 
 
-class Watcher:
-    """What a run tells of itself; the command line shows it, tests ignore it."""
+class Watcher(Protocol):
+    """What a run tells of itself, from several threads."""
 
     def started(self, sequence: str) -> None: ...
 
     def note(self, sequence: str, text: str) -> None: ...
 
     def finished(self, sequence: str, rows: list[StageResult]) -> None: ...
+
+
+class Unwatched:
+    """A watcher that says nothing."""
+
+    def started(self, sequence: str) -> None:
+        pass
+
+    def note(self, sequence: str, text: str) -> None:
+        pass
+
+    def finished(self, sequence: str, rows: list[StageResult]) -> None:
+        pass
 
 
 @dataclass(frozen=True)
@@ -82,7 +95,7 @@ def prepare(
         marks = _colmap_marks(config, inputs)
         plan = list(marks.items())
         tasks.append(_Task(work / source.id, plan, _prepare_one, (source, inputs, config)))
-    return _run(tasks, options, watcher or Watcher())
+    return _run(tasks, options, watcher or Unwatched())
 
 
 def add_masks(
@@ -98,7 +111,7 @@ def add_masks(
         folder = masks.get(sequence.id)
         plan = [("masks", stages.fingerprint("masks", config, _masks_inputs(sequence, folder)))]
         tasks.append(_Task(sequence.folder, plan, _masks_one, (folder, config)))
-    return _run(tasks, options, watcher or Watcher())
+    return _run(tasks, options, watcher or Unwatched())
 
 
 def correspond_all(
@@ -109,7 +122,7 @@ def correspond_all(
     for sequence in sequences:
         plan = [("correspond", stages.fingerprint("correspond", config, _marks(sequence, "depth", "masks")))]
         tasks.append(_Task(sequence.folder, plan, _correspond_one, (config,)))
-    return _run(tasks, options, watcher or Watcher())
+    return _run(tasks, options, watcher or Unwatched())
 
 
 def _run(tasks: list[_Task], options: RunOptions, watcher: Watcher) -> list[StageResult]:

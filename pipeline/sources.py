@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from dope.common import files
-from dope.common.errors import BadInput
+from dope.common.errors import BadInput, UsageError
 from pipeline.photos import PHOTO_SUFFIXES, UNSUPPORTED_PHOTOS, list_photos, natural_order
 from pipeline.sequence import sequence_id
 from pipeline.stages import StageResult
@@ -61,7 +61,7 @@ def find_sources(
     inputs: Iterable[Path],
     *,
     category: str | None = None,
-    category_from: Literal["none", "parent"] = "none",
+    category_from: str = "none",
     masks: str | None = None,
 ) -> tuple[list[Source], list[SourceError]]:
     """The sequences that the paths on a command line stand for, and a row for each path that stands for none.
@@ -76,6 +76,8 @@ def find_sources(
     Returns:
         Sources with unique ids (the parent's name is prefixed where two are the same), and (id, path, error) rows.
     """
+    if category_from not in ("none", "parent"):
+        raise UsageError(f"'{category_from}' is not one of none, parent", where="--category-from")
     found: list[Source] = []
     errors: list[SourceError] = []
     seen: set[Path] = set()

@@ -13,9 +13,8 @@ ROOT = Path(__file__).parents[1]
 
 
 def dope(*words: object, **options) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "cli", *map(str, words)], capture_output=True, text=True, cwd=ROOT, timeout=120, **options
-    )
+    command = [sys.executable, "-m", "cli", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=120, **options)
 
 
 @pytest.mark.parametrize(
@@ -43,8 +42,8 @@ def test_help_imports_nothing_heavy() -> None:
 
 def test_the_help_is_a_tour() -> None:
     text = dope("--help").stdout
-    tour = ["dope prep colmap", "dope prep masks", "dope prep correspond", "dope prep shards", "dope train", "dope eval"]
-    places = [text.index(command) for command in tour]
+    tour = ("prep colmap", "prep masks", "prep correspond", "prep shards", "train", "eval", "figure")
+    places = [text.index(f"dope {command}") for command in tour]
     assert places == sorted(places)
 
 
@@ -68,6 +67,7 @@ def test_shell_completion(shell: str) -> None:
         (("prep", "colmap", "a.mp4", "--out", "w", "--shard-index", "0"), "go together"),
         (("prep", "colmap", "a.mp4", "--out", "w", "--matching", "magic"), "not one of"),
         (("prep", "colmap", "a.mp4", "--out", "w", "--threads", "0"), "must be positive"),
+        (("prep", "colmap", "a.mp4", "--out", "w", "--category-from", "folder"), "not one of none, parent"),
         (("prep", "masks", "nowhere"), "nowhere"),
         (("train", "nowhere", "--out", "run", "--set", "data.batchsize=3"), "did you mean 'batch_size'"),
         (("train", "nowhere", "--out", "run", "--preset", "nanoo"), "did you mean 'nano'"),

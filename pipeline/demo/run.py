@@ -33,10 +33,13 @@ class Plan:
     queries: int
 
 
-FULL = Plan(DemoConfig(), train=(), episodes=1000, ways=4, queries=4)
+FULL = Plan(DemoConfig(), train=(), episodes=1000, ways=4, queries=2)
 TINY = Plan(
     DemoConfig(
-        per_family=2, training_families=("chair", "mug"), novel_families=("bottle", "table"), film=FilmConfig(frames=18)
+        per_family=2,
+        training_families=("chair", "mug"),
+        novel_families=("bottle", "table"),
+        film=FilmConfig(frames=18, detail=0.5),
     ),
     train=("schedule.epochs=2", "data.pairs_per_object=4", "data.batch_size=4"),
     episodes=20,
@@ -84,7 +87,7 @@ def run_demo(out: Path, *, workers: int = 0, tiny: bool = False) -> None:
         videos, work = [out / "videos" / name for name in names], out / f"work-{part}"
         masks = out / "videos" / "masks"
         dope("prep", "colmap", *videos, "--category-from", "parent", "--masks", masks, "--out", work,
-             *base, *("--set", "frames.count=28"), allow_failed_items=True)  # fmt: skip
+             *base, *("--set", f"frames.count={plan.films.film.frames}"), allow_failed_items=True)  # fmt: skip
         dope("prep", "masks", work, *base, allow_failed_items=True)
         dope("prep", "correspond", work, "--every", 1, *base, allow_failed_items=True)
         holdout = ("--holdout", "frames") if part == "train" else ("--holdout", "none")
@@ -95,9 +98,10 @@ def run_demo(out: Path, *, workers: int = 0, tiny: bool = False) -> None:
     dope("train", shards, "--out", run, "--preset", "nano", *settings)
     dope("eval", run, novel, "--ways", plan.ways, "--shots", 1, "--queries", plan.queries,
          "--episodes", plan.episodes, "--compare-untrained")  # fmt: skip
-    dope("figure", run, shards, "--kind", "colouring", "--out", out / "figures")
-    dope("figure", run, novel, "--kind", "colouring", "--out", out / "figures")
-    dope("figure", run, novel, "--kind", "heatmap", "--out", out / "figures")
+    for dataset, names in ((shards, plan.films.training_families), (novel, plan.films.novel_families)):
+        shown = [word for name in names for word in ("--sequence", f"{name}_0")]
+        for kind in ("colouring", "heatmap"):
+            dope("figure", run, dataset, "--kind", kind, *shown, "--masks", "given", "--out", out / "figures")
     _summary(console, out, time.monotonic() - start)
 
 
