@@ -34,6 +34,8 @@ LATEST = "latest"
 def save_checkpoint(run: Path, state: TrainState, config: TrainConfig, dataset: str, keep: int = 0) -> Path:
     """Write RUN/checkpoints/step-XXXXXXXX.pt, its hash and the pointer; delete old ones beyond `keep` (0 keeps all).
 
+    Those of later steps, which a run that went on from an earlier checkpoint finds there, neither count nor go.
+
     Args:
         dataset: fingerprint of the training shards.
     """
@@ -54,12 +56,14 @@ def save_checkpoint(run: Path, state: TrainState, config: TrainConfig, dataset: 
         "versions": {"dope": dope.__version__, "torch": str(torch.__version__)},
     }
     with files.atomic_path(path) as partial:
-        torch.save(values, partial)
+        with partial.open("wb") as file:  # given a path, torch's own writer hides that the disk is full
+            torch.save(values, file)
         digest = files.sha256_of(partial)
     files.write_bytes(_hash_path(path), f"{digest}  {path.name}\n".encode())
     files.write_bytes(path.parent / LATEST, f"{path.name}\n".encode())
     if keep:
-        for old in list_checkpoints(run)[:-keep]:
+        until_now = [other for other in list_checkpoints(run) if other.name <= path.name]
+        for old in until_now[:-keep]:
             old.unlink()
             _hash_path(old).unlink(missing_ok=True)
     return path

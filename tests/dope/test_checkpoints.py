@@ -1,9 +1,11 @@
 import os
 import pickle
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import IO
 
 import pytest
 import torch
@@ -17,7 +19,8 @@ from dope.checkpoints import (
     resume,
     save_checkpoint,
 )
-from dope.common.errors import BadInput, UsageError
+from dope.common import files
+from dope.common.errors import BadInput, DiskFull, UsageError
 from dope.config import TrainConfig, load_config
 from dope.distributed import Ranks
 from dope.order import Place
@@ -87,9 +90,28 @@ def test_old_checkpoints_are_deleted_with_their_hashes(tmp_path: Path) -> None:
     assert latest_checkpoint(tmp_path) == tmp_path / "checkpoints" / stems[1]
 
 
+def test_going_on_from_an_earlier_checkpoint_deletes_neither_the_new_nor_the_later_ones(tmp_path: Path) -> None:
+    for step in (2, 8, 9, 3):  # 3 after 9: a run that went back to an earlier place
+        save_checkpoint(tmp_path, replace(trained(steps=0), step=step), CONFIG, "shards", keep=1)
+    assert [path.name for path in list_checkpoints(tmp_path)] == ["step-00000003.pt", "step-00000009.pt"]
+    assert latest_checkpoint(tmp_path) == tmp_path / "checkpoints" / "step-00000003.pt"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's /dev/full")
+def test_a_full_disk_is_explained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    @contextmanager
+    def full(path: Path) -> Iterator[Path]:
+        with files.explaining_full_disk(path):
+            yield Path("/dev/full")
+
+    monkeypatch.setattr(files, "atomic_path", full)
+    with pytest.raises(DiskFull, match=r"step-00000000\.pt: no space left"):
+        save_checkpoint(tmp_path, trained(steps=0), CONFIG, "shards")
+
+
 def test_a_crash_while_writing_leaves_the_one_before(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def half(values: object, path: Path) -> None:
-        path.write_bytes(b"half")
+    def half(values: object, file: IO[bytes]) -> None:
+        file.write(b"half")
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(torch, "save", half)
