@@ -43,15 +43,15 @@ def train(
 
     Returns:
         `status` (finished, or stopped by a signal or `stop_after`), `step`, `steps_of_this_call`, `epoch`, `loss`,
-        `pck`, `pck_untrained`, `mask_iou`, `checkpoint`, `seconds`, `pairs_per_second`.
+        `pck`, `pck_untrained`, `mask_iou`, `checkpoint`, `seconds`, `pairs_per_second`; None where there is none.
 
     Raises:
         BadInput: shards or checkpoint missing or damaged. UsageError: settings that do not fit them.
-        DopeError: the loss is not finite; the message names the step and the samples.
+        DopeError: the loss is not finite (the message names the step and the samples), or the disk is full.
     """
     check(config)
     keep_heap()
-    with ranks_of(config.device) as ranks, StopRequest() as stop:
+    with files.explaining_full_disk(out), ranks_of(config.device) as ranks, StopRequest() as stop:
         run = open_run(shards, out, config, ranks, resume)
         state, last_step = run.state, run.total_steps
         if stop_after is not None:
@@ -181,7 +181,7 @@ class Run:
             "step": self.state.step,
             "steps_of_this_call": self.state.step - meter.first_step,
             "epoch": self.state.place.epoch,
-            "loss": meter.loss,
+            "loss": None if math.isnan(meter.loss) else meter.loss,  # a finished run has nothing left to measure
             "pck": (self.state.validation or {}).get("pck"),
             "pck_untrained": (self.state.untrained or {}).get("pck"),
             "mask_iou": (self.state.validation or {}).get("mask_iou"),

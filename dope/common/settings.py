@@ -54,13 +54,19 @@ def override(config: Config, assignments: Iterable[str]) -> Config:
     """Apply `section.key=value` strings (values are YAML) to a config.
 
     Raises:
-        UsageError: no "=", an unknown key or a value of the wrong type.
+        UsageError: no "=", an unknown key, or a value that is no YAML or of the wrong type.
     """
     for assignment in assignments:
         path, equals, text = assignment.partition("=")
         if not equals:
             raise UsageError(f"'{assignment}' is not key=value", where="--set")
-        config = _replace(config, path.strip().split("."), yaml.safe_load(text), f"--set {path.strip()}")
+        where = f"--set {path.strip()}"
+        try:
+            value = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            reason = str(error).replace("\n", " ")
+            raise UsageError(f"'{text}' is not valid YAML ({reason})", where=where) from error
+        config = _replace(config, path.strip().split("."), value, where)
     return config
 
 

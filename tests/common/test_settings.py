@@ -47,6 +47,7 @@ def test_override_reads_yaml_values() -> None:
         ("count=true", "not of type"),
         ("inner.sizes=[1, x]", "not of type"),
         ("count", "not key=value"),
+        ("inner.sizes=[1", r"--set inner\.sizes: '\[1' is not valid YAML"),
     ],
 )
 def test_wrong_assignments_are_named(assignment: str, message: str) -> None:

@@ -111,6 +111,7 @@ def test_a_finished_run_has_nothing_to_do(shards: Path, tmp_path: Path) -> None:
     train(shards, tmp_path, tiny("schedule.epochs=1"))
     again = train(shards, tmp_path, tiny("schedule.epochs=1"))
     assert again["status"] == "finished" and again["steps_of_this_call"] == 0 and again["pck"] is not None
+    assert again["loss"] is None  # and no "loss nan" is printed
 
 
 def test_resume_never_insists_on_a_new_folder(shards: Path, tmp_path: Path) -> None:
