@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from dope.common.errors import BadInput, DopeError
 from pipeline import sequence as prepared
 from pipeline.geometry import Camera, Similarity
+from pipeline.sparse_points import SparsePoints
 
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"]
 IMAGE_NAME = re.compile(r"(\d+)\.jpg$")
@@ -41,28 +42,6 @@ if threading.current_thread() is threading.main_thread() and signal.getsignal(si
 
 class ColmapError(DopeError):
     """COLMAP refused its input or failed inside."""
-
-
-@dataclass(frozen=True)
-class SparsePoints:
-    """The triangulated points of a model, and which frames see them.
-
-    Attributes:
-        xyz: (N, 3) world coordinates.
-        rgb: (N, 3) uint8.
-        error: (N,) mean reprojection error, pixels of the stored image.
-        point_index, frame: (M,) int, one entry an observation: point `point_index[m]` is seen in frame `frame[m]`;
-            sorted by point, then frame.
-    """
-
-    xyz: NDArray[np.float64]
-    rgb: NDArray[np.uint8]
-    error: NDArray[np.float64]
-    point_index: NDArray[np.int64]
-    frame: NDArray[np.int64]
-
-    def __len__(self) -> int:
-        return len(self.xyz)
 
 
 class Model:

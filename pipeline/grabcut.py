@@ -24,8 +24,8 @@ from pipeline.object_region import ball_silhouette, pixels_of, points_on_object,
 from pipeline.sequence import Frame, Sequence
 
 if TYPE_CHECKING:
-    from pipeline.colmap import SparsePoints
     from pipeline.masks import MasksConfig
+    from pipeline.sparse_points import Tracks
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class View:
     """Pixels where the view sees a point that is not on the object."""
 
 
-def grabcut_masks(sequence: Sequence, points: SparsePoints, config: MasksConfig) -> dict[str, Any]:
+def grabcut_masks(sequence: Sequence, points: Tracks, config: MasksConfig) -> dict[str, Any]:
     """Write masks/ for the registered frames of a normalised sequence and note them in frames.parquet.
 
     Args:

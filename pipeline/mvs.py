@@ -22,6 +22,7 @@ from pipeline.depth_filter import AgreementConfig, confirmations, drop_islands, 
 from pipeline.geometry import Floats, nearest_point_to_axes
 from pipeline.neighbours import NeighbourConfig, choose_neighbours, sees
 from pipeline.sequence import Frame, Sequence, read_image
+from pipeline.sparse_points import Tracks
 from pipeline.stereo import Depth, View, stereo_depth
 
 Report = Callable[[str, int, int], None]  # what, done, of
@@ -53,30 +54,6 @@ class DepthConfig:
     """Threads of OpenCV. The result is the same with any number."""
 
 
-@dataclass(frozen=True)
-class Tracks:
-    """The points of a reconstruction and the frames that observe them.
-
-    Attributes:
-        xyz: (N, 3) in the world.
-        point_index, frame: (M,) observation m is of point `point_index[m]` in frame number `frame[m]`.
-    """
-
-    xyz: Floats
-    point_index: NDArray[np.integer]
-    frame: NDArray[np.integer]
-
-    def longer_than(self, length: int) -> Tracks:
-        """Only the observations of points that at least `length` frames observe."""
-        lengths = np.bincount(self.point_index, minlength=len(self.xyz))
-        keep = lengths[self.point_index] >= length
-        return Tracks(self.xyz, self.point_index[keep], self.frame[keep])
-
-    def seen_by(self, frame: int) -> Floats:
-        """The points (M, 3) that a frame observes."""
-        return self.xyz[self.point_index[self.frame == frame]]
-
-
 def compute_depth(sequence: Sequence, config: DepthConfig) -> dict[str, Any]:
     """Write depth maps for the registered frames of a sequence that has been reconstructed.
 
@@ -88,8 +65,7 @@ def compute_depth(sequence: Sequence, config: DepthConfig) -> dict[str, Any]:
     """
     from pipeline import colmap
 
-    points = colmap.read_points(sequence)
-    tracks = Tracks(points.xyz, points.point_index, points.frame)
+    tracks = colmap.read_points(sequence)
     if config.mode == "dense" and config.backend != "sgbm":
         if colmap.has_cuda_gpu():
             from pipeline.patchmatch import patchmatch_depth

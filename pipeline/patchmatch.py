@@ -21,7 +21,8 @@ from pipeline.sequence import Frame, Sequence
 from pipeline.stereo import Depth, View, pixel_rays, sample_within_surfaces
 
 if TYPE_CHECKING:
-    from pipeline.mvs import DepthConfig, Tracks
+    from pipeline.mvs import DepthConfig
+    from pipeline.sparse_points import Tracks
 
 EDGE = 0.03  # relative step between neighbouring depths beyond which they are two surfaces
 

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -14,20 +13,12 @@ from pipeline.grabcut import grabcut_masks
 from pipeline.masks import MasksConfig
 from pipeline.object_region import ball_silhouette, pixels_of, points_on_object, support_plane, visual_hull
 from pipeline.sequence import Sequence
+from pipeline.sparse_points import Tracks
 
 cv2.setNumThreads(1)
 
 
-@dataclass
-class Points:
-    """What `pipeline.colmap.SparsePoints` holds, as far as masks need it."""
-
-    xyz: np.ndarray
-    point_index: np.ndarray
-    frame: np.ndarray
-
-
-def seen_points(scene: Scene, cameras: list[Camera], *, each: int = 60, noise: float = 0.01) -> Points:
+def seen_points(scene: Scene, cameras: list[Camera], *, each: int = 60, noise: float = 0.01) -> Tracks:
     """Points on object, floor and sky at random pixels of the views, each seen by the view it comes from and others."""
     rng = np.random.default_rng(0)
     found = []
@@ -44,7 +35,7 @@ def seen_points(scene: Scene, cameras: list[Camera], *, each: int = 60, noise: f
         seen = np.flatnonzero(inside & (np.abs(surface - depth) < 0.05))
         index.append(seen)
         frame.append(np.full(len(seen), number))
-    return Points(xyz, np.concatenate(index), np.concatenate(frame))
+    return Tracks(xyz, np.concatenate(index), np.concatenate(frame))
 
 
 def small_orbit(n: int, distortion: tuple = (0, 0, 0, 0)) -> list[Camera]:
@@ -65,7 +56,7 @@ def test_the_object_is_cut_out_from_points_alone(tmp_path: Path, shape: str, dis
     scene = Scene(shape)  # type: ignore[arg-type]
     cameras = small_orbit(9, distortion=distortion)
     sequence = write_sequence(tmp_path / "a", cameras, scene, masks=False, depths=False)
-    details = grabcut_masks(sequence, seen_points(scene, cameras), MasksConfig())  # type: ignore[arg-type]
+    details = grabcut_masks(sequence, seen_points(scene, cameras), MasksConfig())
     found = ious(sequence, scene, cameras)
     assert np.median(found) > 0.95 and found.min() > 0.85, found
     assert details["masks"] == 9 and details["missing"] == details["empty"] == 0
@@ -78,7 +69,7 @@ def test_the_same_input_gives_the_same_masks(tmp_path: Path) -> None:
     for name in ("a", "b"):
         sequence = write_sequence(tmp_path / name, cameras, scene, masks=False, depths=False)
         cv2.setRNGSeed(len(contents))  # what ran before in the process must not matter
-        grabcut_masks(sequence, points, MasksConfig())  # type: ignore[arg-type]
+        grabcut_masks(sequence, points, MasksConfig())
         contents.append([path.read_bytes() for path in sorted(sequence.masks.iterdir())])
     assert contents[0] == contents[1] and len(contents[0]) == 4
 
@@ -90,16 +81,16 @@ def test_frames_without_a_camera_have_no_mask_and_no_points_are_an_error(tmp_pat
     rows = sequence.read_frames()
     rows[3].clear_camera()
     sequence.write_frames(rows)
-    details = grabcut_masks(sequence, points, MasksConfig())  # type: ignore[arg-type]
+    details = grabcut_masks(sequence, points, MasksConfig())
     assert details["missing_frames"] == ["0003.jpg"] and sequence.read_frames()[3].mask is None
-    far = Points(points.xyz + 50, points.point_index, points.frame)
+    far = Tracks(points.xyz + 50, points.point_index, points.frame)
     with pytest.raises(BadInput, match="no reconstructed point"):
-        grabcut_masks(sequence, far, MasksConfig())  # type: ignore[arg-type]
+        grabcut_masks(sequence, far, MasksConfig())
     for row in rows:
         row.clear_camera()
     sequence.write_frames(rows)
     with pytest.raises(BadInput, match="no registered frames"):
-        grabcut_masks(sequence, points, MasksConfig())  # type: ignore[arg-type]
+        grabcut_masks(sequence, points, MasksConfig())
 
 
 def test_the_floor_is_found_and_a_flat_side_is_not_taken_for_it() -> None:

@@ -14,8 +14,9 @@ from synthetic import Scene, orbit, pixel_centres, write_sequence
 from dope.common.errors import BadInput
 from pipeline import mvs, patchmatch
 from pipeline.geometry import Camera
-from pipeline.mvs import DepthConfig, Tracks, object_centre, sgbm_depth, sparse_depth, write_depths
+from pipeline.mvs import DepthConfig, object_centre, sgbm_depth, sparse_depth, write_depths
 from pipeline.sequence import Sequence
+from pipeline.sparse_points import Tracks
 
 SCENE = Scene()
 CAMERAS = orbit(7, arc_deg=49, distance=4.5, distortion=(0.05, -0.07, 0.001, -0.001), wobble=0.05)
