@@ -17,8 +17,13 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-State = Literal["ok", "missing", "optional"]
-STYLES = {"ok": "[green]ok[/]", "missing": "[red]missing[/]", "optional": "[yellow]not there[/]"}
+State = Literal["ok", "missing", "optional", "unused"]
+STYLES = {
+    "ok": "[green]ok[/]",
+    "missing": "[red]missing[/]",
+    "optional": "[yellow]not there[/]",
+    "unused": "[yellow]unused[/]",
+}
 
 
 @dataclass(frozen=True)
@@ -35,8 +40,7 @@ def examine() -> list[Finding]:
     """Look at this machine. Imports nothing heavy; asks a GPU through nvidia-smi."""
     findings = [Finding("python", "ok", sys.version.split()[0]), _machine()]
     findings += [_package(*entry) for entry in REQUIRED]
-    findings.append(_pycolmap())
-    findings.append(_gpu())
+    findings += [_pycolmap(), _gpu(_version("torch") or "")]
     findings += [_optional(*entry) for entry in OPTIONAL]
     return findings
 
@@ -59,8 +63,8 @@ OPTIONAL = (
 
 def _package(distribution: str, module: str) -> Finding:
     if importlib.util.find_spec(module) is None:
-        return Finding(distribution, "missing", "", "pip install dope-descriptors")
-    return Finding(distribution, "ok", importlib.metadata.version(distribution))
+        return Finding(distribution, "missing", "", f"pip install {distribution}")
+    return Finding(distribution, "ok", _version(distribution) or f"'{module}' from a package of another name")
 
 
 def _pycolmap() -> Finding:
@@ -69,19 +73,32 @@ def _pycolmap() -> Finding:
         detail = "pycolmap and pycolmap-cuda12 are both installed: they overwrite each other"
         return Finding("pycolmap", "missing", detail, "pip uninstall both, then install one of them")
     if not names:
-        return Finding("pycolmap", "missing", "", "pip install dope-descriptors")
+        return Finding("pycolmap", "missing", "", "pip install pycolmap")
     kind = "CUDA: dense depth by PatchMatch" if names[0] == "pycolmap-cuda12" else "CPU: dense depth by stereo pairs"
     return Finding("pycolmap", "ok", f"{_version(names[0])} ({kind})")
 
 
-def _gpu() -> Finding:
+def _gpu(torch_version: str) -> Finding:
+    found = _nvidia_smi()
+    if not found:
+        return Finding("CUDA GPU", "optional", "everything works without one, training far slower")
+    if "+cpu" in torch_version:
+        remedy = "install the CUDA build of torch, see https://pytorch.org/get-started/locally"
+        return Finding("CUDA GPU", "unused", f"{found}; but torch {torch_version} cannot use it", remedy)
+    return Finding("CUDA GPU", "ok", found)
+
+
+def _nvidia_smi() -> str:
+    """The GPUs, or nothing where there is none or the driver does not answer."""
     command = shutil.which("nvidia-smi")
-    if command:
-        query = [command, "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader"]
+    if command is None:
+        return ""
+    query = [command, "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader"]
+    try:
         answer = subprocess.run(query, capture_output=True, text=True, timeout=20, check=False)
-        if answer.returncode == 0 and answer.stdout.strip():
-            return Finding("CUDA GPU", "ok", "; ".join(answer.stdout.strip().splitlines()))
-    return Finding("CUDA GPU", "optional", "everything works without one, training far slower", "")
+    except (subprocess.TimeoutExpired, OSError):
+        return ""
+    return "; ".join(answer.stdout.strip().splitlines()) if answer.returncode == 0 else ""
 
 
 def _optional(what: str, module: str, purpose: str, remedy: str) -> Finding:
