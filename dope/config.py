@@ -179,7 +179,7 @@ def load_config(preset: str | None = None, yaml: Path | None = None, overrides: 
 
 def check(config: TrainConfig) -> None:
     """Raise `UsageError` naming the first setting whose value makes no sense."""
-    data, schedule = config.data, config.schedule
+    data, schedule, network, augmentation = config.data, config.schedule, config.network, config.augmentation
     rules = (
         ("data.image_size", data.image_size >= 32 and data.image_size % 32 == 0, "must be a positive multiple of 32"),
         ("data.batch_size", data.batch_size >= 2, "must be at least 2: the other pairs of a batch are the negatives"),
@@ -187,6 +187,12 @@ def check(config: TrainConfig) -> None:
         ("data.points", data.points >= 1, "must be at least 1"),
         ("data.max_points", data.max_points >= data.points, "must not be less than data.points"),
         ("data.workers", data.workers >= 0, "must not be negative"),
+        ("network.width", network.width > 0, "must be positive"),
+        ("network.pyramid", network.pyramid >= 1, "must be at least 1"),
+        ("network.projector", bool(network.projector) and min(network.projector) >= 1, "must be one or more widths"),
+        ("augmentation.gamma", augmentation.gamma[0] > 0, "must be positive"),
+        ("augmentation.noise", 0 <= augmentation.noise <= 256, "must lie in [0, 256]"),
+        ("augmentation.largest_scale", augmentation.largest_scale > 0, "must be positive"),
         ("loss.temperature", config.loss.temperature > 0, "must be positive"),
         ("loss.mask_weight", config.loss.mask_weight >= 0, "must not be negative"),
         ("loss.chunk", config.loss.chunk >= 1, "must be at least 1"),

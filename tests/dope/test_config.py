@@ -47,6 +47,10 @@ def test_a_file_goes_over_the_preset_and_overrides_over_both(tmp_path: Path) -> 
         (["loss.temperature=0"], "must be positive"),
         (["momentum=1.5"], r"must lie in \[0, 1\]"),
         (["data.max_points=3"], "must not be less than data.points"),
+        (["network.pyramid=0"], "network.pyramid: '0' must be at least 1"),
+        (["network.projector=[]"], "network.projector: .* must be one or more widths"),
+        (["augmentation.gamma=[0, 1]"], "augmentation.gamma: .* must be positive"),
+        (["augmentation.noise=500"], r"must lie in \[0, 256\]"),
     ],
 )
 def test_wrong_settings_are_named(overrides: list[str], message: str) -> None:
