@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -55,7 +56,7 @@ def read_index(folder: Path, split: str) -> SampleIndex:
         BadInput: a file is missing, cut off, or of another dataset; the message names it and what to do.
     """
     manifest = read_manifest(folder)
-    table = _read_table(folder / "index.parquet")
+    table = read_table(folder / "index.parquet", COLUMNS)
     recorded = files.read_json(folder / "dataset.json").get("tables", {}).get("index.parquet")
     if recorded is not None and files.sha256_of(folder / "index.parquet") != recorded:
         raise BadInput("is not the one of dataset.json", where=folder / "index.parquet", remedy=REMAKE)
@@ -102,14 +103,15 @@ def verify_hashes(folder: Path, split: str | None = None) -> None:
             raise BadInput("its SHA-256 is not the one in dataset.json", where=folder / name, remedy=REMAKE)
 
 
-def _read_table(path: Path) -> pa.Table:
+def read_table(path: Path, columns: Sequence[str]) -> pa.Table:
+    """A Parquet file that has these columns. Raises `BadInput` where it is absent, damaged or lacks one."""
     try:
         table = pq.read_table(path)
     except FileNotFoundError:
         raise BadInput("no such file", where=path, remedy=REMAKE) from None
     except (pa.ArrowException, OSError) as error:
         raise BadInput(f"cannot be read ({error})", where=path, remedy=REMAKE) from error
-    missing = [name for name in COLUMNS if name not in table.column_names]
+    missing = [name for name in columns if name not in table.column_names]
     if missing:
         raise BadInput(f"lacks the columns {', '.join(missing)}", where=path, remedy=REMAKE)
     return table

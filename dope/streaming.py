@@ -68,17 +68,18 @@ class PairDataset(Dataset):
         image = _decoded(members, name, cv2.IMREAD_COLOR, where)
         height, width = image.shape[:2]
         scale = np.array([self.image_size / width, self.image_size / height], np.float32)
-        return np.asarray(cv2.cvtColor(self._resized(image), cv2.COLOR_BGR2RGB), np.uint8), scale
+        return np.asarray(cv2.cvtColor(resized(image, self.image_size), cv2.COLOR_BGR2RGB), np.uint8), scale
 
     def _mask(self, members: dict[str, bytes], name: str, where: str) -> NDArray[np.bool_]:
-        return self._resized(_decoded(members, name, cv2.IMREAD_GRAYSCALE, where)) > 127
+        return resized(_decoded(members, name, cv2.IMREAD_GRAYSCALE, where), self.image_size) > 127
 
-    def _resized(self, image: NDArray[np.uint8]) -> NDArray[Any]:
-        size = self.image_size
-        if image.shape[:2] == (size, size):
-            return image
-        shrinks = min(image.shape[:2]) >= size
-        return cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+
+def resized(image: NDArray[Any], size: int | None) -> NDArray[Any]:
+    """The image as a square of `size` pixels, the same in training, evaluation and figures; as it is where None."""
+    if size is None or image.shape[:2] == (size, size):
+        return image
+    shrinks = min(image.shape[:2]) >= size
+    return cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
 
 
 def collate(pairs: Sequence[DecodedPair]) -> PairBatch:

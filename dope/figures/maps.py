@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dope.figures.drawing import Image
 from dope.lowshot.encoding import to_tensor
-from dope.lowshot.views import resized
+from dope.streaming import resized
 
 SURE = 0.5  # soft mask from which a pixel counts as the object
 

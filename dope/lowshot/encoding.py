@@ -19,9 +19,9 @@ from torch import Tensor
 from dope.common.progress import Progress
 from dope.lowshot.views import ViewShards
 from dope.networks import NetworkOutput
+from dope.networks.dope import CELLS_AT_ONCE
 
 LIKELY_OBJECT = 0.3  # cells of at least this soft mask are projected when a view is encoded
-_CELLS_AT_ONCE = 8192  # bounds the projector's 1024-channel activations
 
 
 class Encoder(Protocol):
@@ -161,5 +161,5 @@ class _Describe:
 
     @torch.inference_mode()
     def __call__(self, features: Tensor, norms: NDArray[np.float32]) -> Tensor:
-        parts = [F.normalize(self._network.project(part).float(), dim=1) for part in features.split(_CELLS_AT_ONCE)]
+        parts = [F.normalize(self._network.project(part).float(), dim=1) for part in features.split(CELLS_AT_ONCE)]
         return torch.cat(parts) * torch.from_numpy(norms).to(features.device)[:, None]

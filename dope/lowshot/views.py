@@ -13,12 +13,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from dope.common import files
 from dope.common.errors import BadInput, UsageError
+from dope.shard_index import read_table
+from dope.streaming import resized
 from dope.tar_samples import REMAKE, ShardReader
 
 COLUMNS = ("key", "shard", "offset", "size", "sequence", "instance", "category", "split", "frame")
@@ -160,28 +160,11 @@ class ViewShards:
         return np.stack(images)
 
 
-def resized(image: NDArray[Any], image_size: int | None) -> NDArray[Any]:
-    """The image as a square of `image_size` pixels, as the training loader makes it; as it is where None."""
-    if image_size is None or image.shape[:2] == (image_size, image_size):
-        return image
-    shrinks = min(image.shape[:2]) >= image_size
-    interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    return cv2.resize(image, (image_size, image_size), interpolation=interpolation)
-
-
 def _read_columns(folder: Path) -> dict[str, list[Any]]:
     if not folder.is_dir():
         raise BadInput("no such folder", where=folder, remedy="SHARDS is what `dope prep shards --out` wrote")
     path = folder / "views.parquet"
-    try:
-        table = pq.read_table(path)
-    except FileNotFoundError:
-        raise BadInput("no such file: the folder has no single views", where=path, remedy=REMAKE) from None
-    except (pa.ArrowException, OSError) as error:
-        raise BadInput(f"cannot be read ({error})", where=path, remedy=REMAKE) from error
-    missing = [name for name in COLUMNS if name not in table.column_names]
-    if missing:
-        raise BadInput(f"lacks the columns {', '.join(missing)}", where=path, remedy=REMAKE)
+    table = read_table(path, COLUMNS)
     if not len(table):
         raise BadInput("has no views", where=path, remedy=REMAKE)
     return {name: column.to_pylist() for name, column in zip(table.column_names, table.columns, strict=True)}
