@@ -13,6 +13,8 @@ from dope.commands import evaluate, figure, train
 from dope.common.errors import DopeError, UsageError
 from pipeline.commands import app as prep
 
+INTERRUPTED = 130  # what typer makes of Ctrl-C
+
 app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode="rich",
@@ -90,9 +92,10 @@ def main() -> None:
 
         Console(stderr=True, highlight=False).print(f"[red]error:[/] {escape(str(error))}", soft_wrap=True)
         sys.exit(2 if isinstance(error, UsageError) else 1)
-    except KeyboardInterrupt:
-        typer.echo("interrupted; run the same command again to go on", err=True)
-        sys.exit(130)
+    except SystemExit as end:
+        if end.code == INTERRUPTED:
+            typer.echo("interrupted; run the same command again to go on", err=True)
+        raise
 
 
 if __name__ == "__main__":

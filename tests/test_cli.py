@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+import cli
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -66,7 +68,7 @@ def test_shell_completion(shell: str) -> None:
         (("prep", "colmap", "a.mp4", "--out", "w", "--set", "sfm.max_image_sise=3"), "did you mean 'max_image_size'"),
         (("prep", "colmap", "a.mp4", "--out", "w", "--shard-index", "0"), "go together"),
         (("prep", "colmap", "a.mp4", "--out", "w", "--matching", "magic"), "not one of"),
-        (("prep", "colmap", "a.mp4", "--out", "w", "--threads", "0"), "must be positive"),
+        (("prep", "colmap", "a.mp4", "--out", "w", "--minutes", "0"), "must be positive"),
         (("prep", "colmap", "a.mp4", "--out", "w", "--category-from", "folder"), "not one of none, parent"),
         (("prep", "masks", "nowhere"), "nowhere"),
         (("train", "nowhere", "--out", "run", "--set", "data.batchsize=3"), "did you mean 'batch_size'"),
@@ -78,3 +80,14 @@ def test_wrong_usage_is_explained(words: tuple[str, ...], message: str, tmp_path
     assert answer.returncode in (1, 2)
     assert message in " ".join(answer.stderr.split()) and "Traceback" not in answer.stderr
     assert not (ROOT / "w").exists() and not (ROOT / "run").exists()
+
+
+def test_ctrl_c_says_how_to_go_on(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("dope.doctor.examine", interrupted)
+    monkeypatch.setattr(sys, "argv", ["dope", "doctor"])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == 130 and "run the same command again" in capsys.readouterr().err
