@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +15,7 @@ from dope.common.errors import UsageError
 
 Shards = Annotated[Path, typer.Argument(help="The folder that `dope prep shards --out` wrote.", show_default=False)]
 Run = Annotated[Path, typer.Argument(help="A run (its newest checkpoint) or a checkpoint.", show_default=False)]
-Device = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
+Device = Annotated[str, typer.Option(help="auto, cpu, cuda or cuda:N.")]
 
 
 def train(
@@ -31,15 +32,16 @@ def train(
     resume: Annotated[
         str, typer.Option(help="auto: go on where RUN stopped; never: insist on a new RUN; or a checkpoint.")
     ] = "auto",
-    nproc: Annotated[int, typer.Option(help="Processes on this machine (what torchrun would start).")] = 1,
+    nproc: Annotated[int, typer.Option(min=1, help="Processes on this machine (what torchrun would start).")] = 1,
     stop_after: Annotated[
-        int | None, typer.Option(help="Stop with a checkpoint after so many steps.", show_default=False)
+        int | None, typer.Option(min=1, help="Stop with a checkpoint after so many steps.", show_default=False)
     ] = None,
 ) -> None:
     """Train DOPE: corresponding pixels of two views get the same descriptor, all others different ones.
 
-    RUN receives config.yaml, checkpoints/, metrics.jsonl and tensorboard/. Run it again to go on; SIGTERM and
-    Ctrl-C write a checkpoint and exit with 75, on which a batch system can requeue.
+    RUN receives config.yaml (all settings, to look up and to change by --set), checkpoints/, metrics.jsonl and
+    tensorboard/. Run it again to go on; SIGTERM and Ctrl-C write a checkpoint and exit with 75, on which a batch
+    system can requeue.
 
     Examples:
 
@@ -53,6 +55,9 @@ def train(
 
     resolved = load_config(preset, config, set_ or ())
     if nproc > 1 and "RANK" not in os.environ:
+        from dope.shard_index import read_index
+
+        read_index(shards, "train")  # what is wrong with them is said once, here, not by every process
         raise typer.Exit(_launch(nproc))
 
     from dope.stop_signals import EXIT_STOPPED
@@ -182,9 +187,27 @@ def figure(
 
 
 def _launch(nproc: int) -> int:
-    """Start this very command under torchrun, without --nproc's effect in the children (they see RANK)."""
+    """Start this very command under torchrun, without --nproc's effect in the children (they see RANK).
+
+    SIGTERM and Ctrl-C are handed on, and torchrun lets the processes write a checkpoint (it waits 30 s). It ends with
+    1 however they ended; a run that was asked to stop ends with 75 here, as that of one process does.
+    """
+    from dope.stop_signals import EXIT_STOPPED
+
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(nproc)]
-    return subprocess.run([*command, "-m", "cli", *sys.argv[1:]], check=False).returncode
+    asked = False
+    # "--", or torchrun takes our --nproc for its own; a session of its own, or Ctrl-C of a terminal reaches it twice
+    process = subprocess.Popen([*command, "-m", "--", "cli", *sys.argv[1:]], start_new_session=True)
+
+    def hand_on(number: int, frame: object) -> None:
+        nonlocal asked
+        asked = True
+        process.terminate()
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, hand_on)
+    code = process.wait()
+    return EXIT_STOPPED if asked and code else code
 
 
 def _print_training(result: dict[str, Any], out: Path) -> None:
@@ -201,13 +224,9 @@ def _print_training(result: dict[str, Any], out: Path) -> None:
 
 
 def _device(name: str) -> str:
-    import torch
+    from dope.distributed import pick_device
 
-    if name == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    if name.startswith("cuda") and not torch.cuda.is_available():
-        raise UsageError("PyTorch sees no CUDA device here", where="--device", remedy="Use --device cpu")
-    return name
+    return str(pick_device(name, flag="--device "))
 
 
 def _check_choice(value: str, flag: str, choices: tuple[str, ...]) -> None:

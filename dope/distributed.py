@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -97,17 +98,19 @@ def ranks_of(device: str) -> Iterator[Ranks]:
     try:
         yield Ranks(rank, world, chosen)
     finally:
+        gc.collect()  # what DistributedDataParallel holds of the group must go before the group's threads do
         dist.destroy_process_group()
 
 
-def pick_device(name: str, local_rank: int = 0) -> torch.device:
-    """The torch device that a setting means. Raises `UsageError` where there is no such device."""
+def pick_device(name: str, local_rank: int = 0, *, flag: str = "--set device=") -> torch.device:
+    """The torch device that a setting means. Raises `UsageError`, naming `flag`, where there is no such device."""
+    where = flag.rstrip(" =")
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         device = torch.device(name)
     except RuntimeError:
-        raise UsageError(f"'{name}' is no device", where="device", remedy="Use auto, cpu, cuda or cuda:N") from None
+        raise UsageError(f"'{name}' is no device", where=where, remedy="Use auto, cpu, cuda or cuda:N") from None
     if device.type != "cuda":
         return device
     device = torch.device("cuda", local_rank if device.index is None else device.index)
@@ -115,7 +118,7 @@ def pick_device(name: str, local_rank: int = 0) -> torch.device:
         found = torch.cuda.device_count() if torch.cuda.is_available() else 0
         raise UsageError(
             f"there is no {device}: PyTorch sees {found} GPUs",
-            where="device",
-            remedy="Use --set device=cpu, fewer processes, or the CUDA build of PyTorch",
+            where=where,
+            remedy=f"Use {flag}cpu, fewer processes, or the CUDA build of PyTorch",
         )
     return device

@@ -8,6 +8,7 @@ import torch
 import two_ranks
 from tiny_shards import write_shards
 
+from dope import commands
 from dope.checkpoints import list_checkpoints, load_network
 from dope.common.errors import UsageError
 from dope.config import load_config
@@ -99,7 +100,7 @@ def test_two_ranks_train_and_one_goes_on(shards: Path, tmp_path: Path) -> None:
     ]  # fmt: skip
     arguments = [argument for value in settings for argument in ("--set", value)]
     done = torchrun(
-        "-m", "dope.trainer_main", str(shards), "--out", str(tmp_path), "--preset", "nano", *arguments,
+        "-m", "cli", "train", str(shards), "--out", str(tmp_path), "--preset", "nano", *arguments,
         "--stop-after", "3",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -125,8 +126,12 @@ def test_devices() -> None:
         pick_device("gpu7")
     if not torch.cuda.is_available():
         assert pick_device("auto").type == "cpu"
-        with pytest.raises(UsageError, match=r"there is no cuda:0: PyTorch sees 0 GPUs.*device=cpu"):
+        with pytest.raises(UsageError, match=r"there is no cuda:0: PyTorch sees 0 GPUs.*--set device=cpu"):
             pick_device("cuda")
+        with pytest.raises(UsageError, match=r"^--device: there is no cuda:0.*--device cpu"):
+            commands._device("cuda")
+    with pytest.raises(UsageError, match=r"^--device: 'gpu7' is no device"):
+        commands._device("gpu7")
 
 
 def test_synchronised_batchnorm_needs_cuda() -> None:
