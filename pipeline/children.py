@@ -16,7 +16,8 @@ import tempfile
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -44,11 +45,16 @@ class ChildFailed(BadInput):
     """The child died or ran out of its limits."""
 
 
+class ChildStopped(ChildFailed):
+    """The child was ended from here (Ctrl-C) before it was done; that says nothing of its item."""
+
+
 _stopping = threading.Event()
+_environment = threading.Lock()
 
 
 def stop_children() -> None:
-    """End all running children: their callers get `ChildFailed`. For Ctrl-C; there is no way back."""
+    """End all running children: their callers get `ChildStopped`. For Ctrl-C; there is no way back."""
     _stopping.set()
 
 
@@ -62,13 +68,14 @@ def run_in_child(work: Callable[..., Any], *args: Any, limits: Limits, notify: N
 
     Raises:
         ChildFailed: the child was killed, crashed, ran out of time or memory; the message says which.
+        ChildStopped: `stop_children` was called.
         Exception: whatever `work` raised.
     """
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
     with tempfile.NamedTemporaryFile(prefix="dope-child-", suffix=".log") as log:
         child = context.Process(target=_child_main, args=(sender, log.name, limits, work, args), daemon=False)
-        with _single_threaded_environment(limits.threads):
+        with _thread_counts_in_environment(limits.threads):
             child.start()
         sender.close()
         try:
@@ -85,16 +92,16 @@ def _listen(receiver: Connection, child: Any, limits: Limits, notify: Notify | N
     while True:
         if not receiver.poll(max(0.0, min(0.5, deadline - time.monotonic()))):
             if _stopping.is_set():
-                raise ChildFailed("was stopped before it was done", remedy="Run the same command again to go on")
+                raise ChildStopped("was stopped before it was done", remedy="Run the same command again to go on")
             if time.monotonic() < deadline:
                 continue
             raise ChildFailed(
                 f"took longer than {limits.minutes:g} minutes and was stopped",
-                remedy="Raise --minutes, or use fewer or smaller frames (--count, --long-side)",
+                remedy="Raise --minutes and add --retry-failed, or use fewer or smaller frames (--count, --long-side)",
             )
         try:
             kind, value = receiver.recv()
-        except EOFError:
+        except (EOFError, OSError):  # OSError: it was killed in the midst of a message
             child.join()
             raise ChildFailed(_cause_of_death(child.exitcode, limits, log)) from None
         if kind == "note":
@@ -113,27 +120,29 @@ def _cause_of_death(exitcode: int | None, limits: Limits, log: Path) -> str:
         name = signal.Signals(-exitcode).name
         if name == "SIGKILL":
             said += f" (often a lack of memory; its own limit is {limits.memory_gib:g} GiB, --memory-gib)"
+            said += ". Use fewer --workers or smaller frames, and add --retry-failed"
         return f"the process was ended by {name}{said}"
     return f"the process ended with exit code {exitcode}{said}"
 
 
-class _single_threaded_environment:
-    """Set the thread counts that native libraries read at import, for the child's start only."""
+@contextmanager
+def _thread_counts_in_environment(threads: int) -> Iterator[None]:
+    """Set the thread counts that native libraries read at import, for the child's start only.
 
-    def __init__(self, threads: int) -> None:
-        names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-        self.values = {name: str(threads) for name in names}
-
-    def __enter__(self) -> None:
-        self.before = {name: os.environ.get(name) for name in self.values}
-        os.environ.update(self.values)
-
-    def __exit__(self, *_: object) -> None:
-        for name, value in self.before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+    One child at a time: the environment is the whole process's, and children start from several threads.
+    """
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    with _environment:
+        before = {name: os.environ.get(name) for name in names}
+        os.environ.update(dict.fromkeys(names, str(threads)))
+        try:
+            yield
+        finally:
+            for name, value in before.items():
+                if value is None:
+                    del os.environ[name]
+                else:
+                    os.environ[name] = value
 
 
 def _child_main(sender: Connection, log: str, limits: Limits, work: Callable[..., Any], args: tuple[Any, ...]) -> None:
@@ -149,8 +158,6 @@ def _child_main(sender: Connection, log: str, limits: Limits, work: Callable[...
 
         cv2.setNumThreads(limits.threads)
         result: tuple[str, Any] = ("result", work(*args, lambda text: sender.send(("note", text))))
-    except MemoryError:
-        result = ("error", _out_of_memory(limits))
     except BaseException as error:
         result = ("error", _portable(error, limits))
     sender.send(result)
@@ -165,18 +172,29 @@ def _die_with_parent() -> None:
         import ctypes
 
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+        parent = multiprocessing.parent_process()
+        if parent is not None and os.getppid() != parent.pid:
+            os._exit(1)  # it was killed before this was asked for
 
 
 def _out_of_memory(limits: Limits) -> ChildFailed:
     return ChildFailed(
         f"needed more than {limits.memory_gib:g} GiB of memory",
-        remedy="Raise --memory-gib, or use fewer or smaller frames (--count, --long-side)",
+        remedy="Raise --memory-gib and add --retry-failed, or use fewer or smaller frames (--count, --long-side)",
     )
+
+
+def is_lack_of_memory(error: BaseException) -> bool:
+    """Whether an error of Python, C++ or OpenCV says that memory ran out."""
+    if isinstance(error, DopeError):  # says what it has to say
+        return False
+    names = ("bad_alloc", "OutOfMemory", "Insufficient memory")
+    return isinstance(error, MemoryError) or any(name in str(error) for name in names)
 
 
 def _portable(error: BaseException, limits: Limits) -> BaseException:
     """The error itself if it can be sent, else its text; lack of memory by any name becomes one message."""
-    if not isinstance(error, DopeError) and ("bad_alloc" in str(error) or "OutOfMemory" in str(error)):
+    if is_lack_of_memory(error):
         return _out_of_memory(limits)
     try:
         pickle.loads(pickle.dumps(error))

@@ -9,11 +9,12 @@ import fcntl
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
+from dope.common import files
 from dope.common.errors import BadInput, UsageError
 from pipeline.children import stop_children
 
@@ -80,28 +81,16 @@ def _count(env: Mapping[str, str], name: str) -> int:
     return _number(env, name)
 
 
-def run_items(
-    items: Sequence[Item], work: Callable[[Item], Result], *, workers: int, done: Callable[[Result], None] | None = None
-) -> list[Result]:
+def run_items(items: Sequence[Item], work: Callable[[Item], Result], *, workers: int) -> list[Result]:
     """Call `work` on every item, `workers` at a time, each in a thread that waits for a child process.
 
     `work` turns failures of an item into its result; what it raises (a full disk, Ctrl-C) stops the whole run: no new
     item is started, and the error is raised when the running ones have ended.
-
-    Args:
-        done: called with each result as it comes, in this thread's stead; must be thread-safe.
     """
-
-    def one(item: Item) -> Result:
-        result = work(item)
-        if done:
-            done(result)
-        return result
-
     if workers <= 1 or len(items) <= 1:
-        return [one(item) for item in items]
+        return [work(item) for item in items]
     with ThreadPoolExecutor(max_workers=workers) as pool:
-        futures = [pool.submit(one, item) for item in items]
+        futures = [pool.submit(work, item) for item in items]
         try:
             wait(futures, return_when=FIRST_EXCEPTION)
         except KeyboardInterrupt:
@@ -118,13 +107,20 @@ def run_items(
 
 @contextmanager
 def holding(folder: Path) -> Iterator[None]:
-    """Hold a sequence's folder for this process; a second run is told who holds it.
+    """Hold a sequence's folder for this process; a second run is told who holds it. Clears what killed runs left.
 
     Raises:
-        BadInput: another process works on the folder.
+        BadInput: another process works on the folder, or it cannot be written to.
+        DiskFull: there is no room for it.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / ".lock").open("a+") as lock:
+    try:
+        with files.explaining_full_disk(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            file = (folder / ".lock").open("a+")
+    except OSError as error:
+        remedy = "Check its permissions, or choose another WORK"
+        raise BadInput(f"cannot be written to ({error.strerror})", where=folder, remedy=remedy) from error
+    with file as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -133,9 +129,11 @@ def holding(folder: Path) -> Iterator[None]:
             raise BadInput(
                 f"is being worked on by {holder}", where=folder, remedy="Wait for it, or stop it, then run again"
             ) from None
-        lock.truncate(0)
-        lock.write(f"process {os.getpid()} on {os.uname().nodename}")
-        lock.flush()
+        with suppress(OSError):  # who holds it is a courtesy; a full disk is the stage's to report
+            os.ftruncate(lock.fileno(), 0)
+            os.write(lock.fileno(), f"process {os.getpid()} on {os.uname().nodename}".encode())
+        for place in (folder, folder / "stages"):
+            files.clear_leftovers(place)
         yield
 
 

@@ -93,6 +93,7 @@ def extract_frames(
     ordered = _is_ordered(source, looks, config)
     info = SequenceInfo(source.id, str(source.path), source.kind, source.category, source.instance)
     info.ordered, info.n_frames = ordered, len(kept)
+    info.masks_from = "input" if source.masks is not None else None
     sequence.write_info(info)
     reasons = Counter(_kind(row.dropped) for row in rows if row.dropped is not None)
     details: dict[str, Any] = {"frames": len(rows), "kept": len(kept), "dropped": dict(sorted(reasons.items()))}
@@ -200,7 +201,8 @@ def _too_few(rows: list[Frame], kept: int, source: Source, config: FramesConfig)
     reasons = Counter(_kind(row.dropped) for row in rows if row.dropped is not None)
     listed = ", ".join(f"{count} {kind}" for kind, count in reasons.most_common())
     total = f"{kept} of {len(rows)} frames are usable, {config.min_frames} are needed"
-    what, remedy = f"too few frames: {total}", "Film longer, or set frames.min_frames"
+    more = "Film longer" if source.kind == "video" else "Take more photos"
+    what, remedy = f"too few frames: {total}", f"{more}, or lower --set frames.min_frames={config.min_frames}"
     worst = reasons.most_common(1)[0][0] if reasons else ""
     if worst == "near-duplicate" and kept + reasons[worst] >= config.min_frames:
         what, remedy = f"the camera does not move: {total}", "Walk around the object, or turn it"
@@ -208,6 +210,10 @@ def _too_few(rows: list[Frame], kept: int, source: Source, config: FramesConfig)
         what, remedy = f"the frames show nothing: {total}", "Is the lens covered, or the exposure wrong?"
     elif worst == "blurred":
         what, remedy = f"the frames are blurred: {total}", "Move more slowly, or lower frames.quality.blur_relative"
+    elif worst == "other size":
+        what, remedy = f"the photos have different sizes: {total}", "Give each size a folder of its own"
+    elif worst == "not sampled":
+        remedy = "Take more of the photos: a smaller --every, a larger --count"
     return BadInput(f"{what} ({listed})" if listed else what, where=source.path, remedy=remedy)
 
 

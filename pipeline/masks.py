@@ -10,6 +10,7 @@ What counts as object in a mask file, whatever its bit depth:
 from __future__ import annotations
 
 import re
+import shutil
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -74,6 +75,26 @@ def import_masks(sequence: Sequence, folder: Path, config: MasksConfig) -> dict[
 
     nothing = BadInput("all masks are empty", where=folder, remedy="Object pixels are bright, the others black")
     return write_masks(sequence, frames, fitted(), min_share=config.min_share, nothing=nothing)
+
+
+def restore_input_masks(sequence: Sequence, folder: Path | None, config: MasksConfig) -> None:
+    """Put the masks that came with the input (`folder`, or none) in the place of those that were made later.
+
+    A new reconstruction starts from its input alone, so that it does not depend on what was run before.
+    """
+    info = sequence.read_info()
+    if not info.masks_are_later:
+        return
+    if folder is not None:
+        import_masks(sequence, folder, config)
+    else:
+        frames = sequence.read_frames()
+        for frame in frames:
+            frame.mask = None
+        sequence.write_frames(frames)
+        shutil.rmtree(sequence.masks, ignore_errors=True)
+    info.masks_from = None if folder is None else "input"
+    sequence.write_info(info)
 
 
 def find_mask_folders(given: str, ids: list[str]) -> dict[str, Path]:

@@ -123,7 +123,7 @@ def median_angles_deg(model: colmap.Model) -> tuple[float, float]:
     return float(np.median(at_point)), float(np.median(of_cameras))
 
 
-def largest_angles_deg(rays: Floats, group: NDArray[np.int64], n: int) -> Floats:
+def largest_angles_deg(rays: Floats, group: NDArray[np.integer], n: int) -> Floats:
     """Largest angle between two unit vectors of the same group, for groups sorted and numbered 0 .. n - 1."""
     lengths = np.bincount(group, minlength=n)
     largest = np.zeros(n)

@@ -97,7 +97,8 @@ def write_depths(sequence: Sequence, tracks: Tracks, config: DepthConfig, method
     cv2.setNumThreads(config.threads)
     try:
         long_tracks = tracks.longer_than(config.min_track)
-        views = [load_view(sequence, frame, long_tracks, config) for frame in registered]
+        masked = not sequence.read_info().masks_are_later
+        views = [load_view(sequence, frame, long_tracks, config, masked=masked) for frame in registered]
         depths = method(sequence, registered, views, tracks, config)
     finally:
         cv2.setNumThreads(threads)
@@ -121,7 +122,7 @@ def _clear(sequence: Sequence, frames: list[Frame]) -> None:
     shutil.rmtree(sequence.depths, ignore_errors=True)
 
 
-def load_view(sequence: Sequence, frame: Frame, tracks: Tracks, config: DepthConfig) -> View:
+def load_view(sequence: Sequence, frame: Frame, tracks: Tracks, config: DepthConfig, *, masked: bool = True) -> View:
     """A registered frame at working resolution, with the points that it sees (on the object, where a mask says so)."""
     scale = min(1.0, config.long_side / max(frame.width, frame.height))
     size = max(1, round(frame.width * scale)), max(1, round(frame.height * scale))
@@ -131,7 +132,7 @@ def load_view(sequence: Sequence, frame: Frame, tracks: Tracks, config: DepthCon
         gray = np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8)
     camera = frame.camera.resized(*size)
     points = tracks.seen_by(frame.frame)
-    mask = sequence.read_mask(frame)
+    mask = sequence.read_mask(frame) if masked else None
     if mask is None:
         return View(camera, gray, points)
     margin = max(1, round(config.mask_margin * max(size)))

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dope.common.errors import BadInput
+from dope.common.files import TEMPORARY
 from pipeline import colmap
 from pipeline.depth_filter import drop_islands
 from pipeline.geometry import Camera
@@ -38,7 +39,7 @@ def patchmatch_depth(
         ColmapError: no CUDA device, or PatchMatch failed.
     """
     depths: list[Depth | None] = []
-    with tempfile.TemporaryDirectory(prefix=".patchmatch-", dir=sequence.folder) as name:
+    with tempfile.TemporaryDirectory(prefix=".patchmatch-", suffix=TEMPORARY, dir=sequence.folder) as name:
         workspace = Path(name)
         colmap.undistort(sequence.sparse, sequence.images, workspace, max_image_size=config.long_side)
         colmap.patch_match(workspace, max_image_size=config.long_side)

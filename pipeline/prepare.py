@@ -6,18 +6,19 @@ widen them; `shards.write_shards` packs them. Each sequence works in a child pro
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 from dope.common.errors import BadInput, DiskFull, DopeError
 from pipeline import stages
-from pipeline.children import ChildFailed, Limits, Notify, run_in_child
+from pipeline.children import ChildFailed, ChildStopped, Limits, Notify, run_in_child
 from pipeline.correspondences import CorrespondConfig, correspond
 from pipeline.engines import holding, run_items
 from pipeline.frames import FramesConfig, extract_frames
-from pipeline.masks import MasksConfig, import_masks
+from pipeline.masks import MasksConfig, import_masks, restore_input_masks
 from pipeline.mvs import DepthConfig, compute_depth
 from pipeline.sequence import Sequence
 from pipeline.sfm import SfmConfig, reconstruct
@@ -70,15 +71,22 @@ class Unwatched:
         pass
 
 
+COLMAP_STAGES = ("frames", "sfm", "depth")
+
+
 @dataclass(frozen=True)
 class _Task:
     """One sequence's work: `plan` says what is expected to be done, `run` does it in a child."""
 
     folder: Path
-    plan: list[tuple[str, str]]
-    """(stage, fingerprint) in order."""
+    stages: tuple[str, ...]
+    """In order."""
+    plan: dict[str, str]
+    """Fingerprint of each stage; empty where the input cannot even be read."""
     run: Callable[..., list[StageResult]]
     arguments: tuple[Any, ...]
+    refusal: str | None = None
+    """Why nothing may be run."""
 
 
 def prepare(
@@ -91,10 +99,14 @@ def prepare(
     """
     tasks = []
     for source in sources:
-        inputs = source_fingerprint(source)
-        marks = _colmap_marks(config, inputs)
-        plan = list(marks.items())
-        tasks.append(_Task(work / source.id, plan, _prepare_one, (source, inputs, config)))
+        folder, plan, inputs, refusal = work / source.id, {}, None, None
+        try:
+            inputs = source_fingerprint(source)
+            plan = _colmap_marks(config, inputs)
+            refusal = _other_input(Sequence(folder), source)
+        except BadInput as error:
+            refusal = str(error)
+        tasks.append(_Task(folder, COLMAP_STAGES, plan, _prepare_one, (source, inputs, config), refusal))
     return _run(tasks, options, watcher or Unwatched())
 
 
@@ -109,8 +121,8 @@ def add_masks(
     tasks = []
     for sequence in sequences:
         folder = masks.get(sequence.id)
-        plan = [("masks", stages.fingerprint("masks", config, _masks_inputs(sequence, folder)))]
-        tasks.append(_Task(sequence.folder, plan, _masks_one, (folder, config)))
+        plan = {"masks": stages.fingerprint("masks", config, _masks_inputs(sequence, folder))}
+        tasks.append(_Task(sequence.folder, ("masks",), plan, _masks_one, (folder, config)))
     return _run(tasks, options, watcher or Unwatched())
 
 
@@ -120,14 +132,16 @@ def correspond_all(
     """Views, pairs and pixel correspondences of every sequence."""
     tasks = []
     for sequence in sequences:
-        plan = [("correspond", stages.fingerprint("correspond", config, _marks(sequence, "depth", "masks")))]
-        tasks.append(_Task(sequence.folder, plan, _correspond_one, (config,)))
+        plan = {"correspond": stages.fingerprint("correspond", config, _marks(sequence, "depth", "masks"))}
+        tasks.append(_Task(sequence.folder, ("correspond",), plan, _correspond_one, (config,)))
     return _run(tasks, options, watcher or Unwatched())
 
 
 def _run(tasks: list[_Task], options: RunOptions, watcher: Watcher) -> list[StageResult]:
     def one(task: _Task) -> list[StageResult]:
         rows = _already_done(task, options)
+        if rows is None and task.refusal is not None:
+            rows = [_failed(task.folder, task.stages[0], task.refusal)]
         if rows is None:
             watcher.started(task.folder.name)
             rows = _in_child(task, options, watcher)
@@ -140,10 +154,10 @@ def _run(tasks: list[_Task], options: RunOptions, watcher: Watcher) -> list[Stag
 
 def _already_done(task: _Task, options: RunOptions) -> list[StageResult] | None:
     """The rows of a sequence whose markers say that nothing is to be done, read without starting a process."""
-    if options.overwrite:
+    if options.overwrite or not task.plan:
         return None
     rows = []
-    for stage, mark in task.plan:
+    for stage, mark in task.plan.items():
         row = stages.read_marker(Sequence(task.folder), stage)
         if row is None or row.fingerprint != mark or (options.retry_failed and row.status == "failed"):
             return None
@@ -155,12 +169,12 @@ def _already_done(task: _Task, options: RunOptions) -> list[StageResult] | None:
 
 
 def _in_child(task: _Task, options: RunOptions, watcher: Watcher) -> list[StageResult]:
-    current = [task.plan[0][0]]
+    started: list[str] = []
 
     def note(text: str) -> None:
         stage, _, rest = text.partition(": ")
         if stage in stages.LATER_STAGES:
-            current[0] = stage
+            started.append(stage)
         watcher.note(task.folder.name, text if rest else stage)
 
     try:
@@ -169,19 +183,36 @@ def _in_child(task: _Task, options: RunOptions, watcher: Watcher) -> list[StageR
                 rows: list[StageResult] = run_in_child(
                     task.run, task.folder, *task.arguments, options, limits=options.limits, notify=note
                 )
+            except ChildStopped:
+                raise
             except ChildFailed as error:  # the child could not write its own marker
-                mark = dict(task.plan)[current[0]]
-                rows = [_failed(task.folder, current[0], str(error), mark)]
-                stages.write_marker(Sequence(task.folder), rows[0])
+                if not started:  # not even its modules could be loaded: no stage is to blame
+                    raise
+                sequence, stage = Sequence(task.folder), started[-1]
+                stages.blame_full_disk(sequence, stage, str(error))
+                rows = [_failed(task.folder, stage, str(error), task.plan[stage])]
+                stages.write_marker(sequence, rows[0])
             return rows
     except DiskFull:
         raise
     except DopeError as error:
-        return [_failed(task.folder, current[0], str(error))]
+        return [_failed(task.folder, started[-1] if started else task.stages[0], str(error))]
 
 
 def _failed(folder: Path, stage: str, reason: str, mark: str = "") -> StageResult:
     return StageResult(folder.name, stage, "failed", reason=reason, fingerprint=mark)
+
+
+def _other_input(sequence: Sequence, source: Source) -> str | None:
+    """Why a source must not take the place of what WORK/<id> holds: another input, still there, has the same name."""
+    try:
+        before = Path(sequence.read_info().source)
+    except (BadInput, TypeError):
+        return None
+    if not before.exists() or before.samefile(source.path):
+        return None
+    remedy = "Rename one of them, choose another --out, or delete that folder"
+    return str(BadInput(f"{sequence.folder} holds the sequence of {before} already", where=source.path, remedy=remedy))
 
 
 def _colmap_marks(config: ColmapConfig, inputs: Any) -> dict[str, str]:
@@ -197,9 +228,14 @@ def _prepare_one(
     marks = _colmap_marks(config, inputs)
     again: dict[str, Any] = {"overwrite": options.overwrite, "retry_failed": options.retry_failed}
     threads = options.limits.threads
+
+    def sfm() -> dict[str, Any]:
+        restore_input_masks(sequence, source.masks, MasksConfig())
+        return reconstruct(sequence, replace(config.sfm, threads=threads))
+
     steps: list[tuple[str, Any, Any, Callable[[], dict[str, Any]]]] = [
         ("frames", config.frames, inputs, lambda: extract_frames(source, sequence, config.frames)),
-        ("sfm", config.sfm, marks["frames"], lambda: reconstruct(sequence, replace(config.sfm, threads=threads))),
+        ("sfm", config.sfm, marks["frames"], sfm),
         ("depth", config.depth, marks["sfm"], lambda: compute_depth(sequence, replace(config.depth, threads=threads))),
     ]
     rows = []
@@ -227,16 +263,35 @@ def _masks_one(
     sequence = Sequence(folder)
 
     def work() -> dict[str, Any]:
+        given = stages.require(sequence, "frames", "dope prep colmap").details.get("masks")
         if masks is not None:
-            return {"from": str(masks), **import_masks(sequence, masks, config)}
-        if any(frame.mask for frame in sequence.read_frames()):
-            done = stages.require(sequence, "frames", "dope prep colmap")
-            return {"from": "given to `dope prep colmap`", **done.details.get("masks", {})}
-        return {"from": "GrabCut", **_grabcut(sequence, config)}
+            with _masks_of(sequence, "import"):
+                return {"from": str(masks), **import_masks(sequence, masks, config)}
+        if given is None:
+            with _masks_of(sequence, "grabcut"):
+                return {"from": "GrabCut", **_grabcut(sequence, config)}
+        if sequence.read_info().masks_are_later:
+            remedy = "Name a folder with --from, or bring them back with `dope prep colmap --overwrite`"
+            raise BadInput("the masks given to `dope prep colmap` were replaced since", where=folder, remedy=remedy)
+        return {"from": "given to `dope prep colmap`", **given}
 
     notify("masks: started")
     again: dict[str, Any] = {"overwrite": options.overwrite, "retry_failed": options.retry_failed}
     return [run_stage(sequence, "masks", config, _masks_inputs(sequence, masks), work, **again)]
+
+
+@contextmanager
+def _masks_of(sequence: Sequence, whose: Literal["import", "grabcut"]) -> Iterator[None]:
+    """Note whose the masks are before they are written: nobody's masks are ever taken for the input's."""
+    info = sequence.read_info()
+    before, info.masks_from = info.masks_from, whose
+    sequence.write_info(info)
+    try:
+        yield
+    except BadInput:  # then none was written
+        info.masks_from = before
+        sequence.write_info(info)
+        raise
 
 
 def _grabcut(sequence: Sequence, config: MasksConfig) -> dict[str, Any]:
@@ -252,8 +307,9 @@ def _correspond_one(folder: Path, config: CorrespondConfig, options: RunOptions,
 
     def work() -> dict[str, Any]:
         stages.require(sequence, "depth", "dope prep colmap")
-        if stages.read_marker(sequence, "masks") is None and not any(f.mask for f in sequence.read_frames()):
-            raise BadInput("has no masks", where=folder, remedy="Run `dope prep masks` first")
+        came_with_input = not sequence.read_info().masks_are_later and any(f.mask for f in sequence.read_frames())
+        if not came_with_input or stages.read_marker(sequence, "masks") is not None:
+            stages.require(sequence, "masks", "dope prep masks")
         return correspond(sequence, config)
 
     notify("correspond: started")

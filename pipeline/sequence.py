@@ -20,7 +20,7 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -133,6 +133,13 @@ class SequenceInfo:
     registered_share: float = 0.0
     attempts: list[dict[str, Any]] = field(default_factory=list)
     """Every reconstruction attempt: settings, registered share, mean reprojection error, accepted or why not."""
+    masks_from: Literal["input", "import", "grabcut"] | None = None
+    """Whose the masks are: they came with the input, were imported by `prep masks`, or cut out by it."""
+
+    @property
+    def masks_are_later(self) -> bool:
+        """True where the masks were made after the cameras: cameras and depth must not depend on them."""
+        return self.masks_from in ("import", "grabcut")
 
 
 class Sequence:

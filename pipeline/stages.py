@@ -20,6 +20,7 @@ from typing import Any, Literal
 import dope
 from dope.common import files, settings
 from dope.common.errors import BadInput, DiskFull, DopeError
+from pipeline.children import is_lack_of_memory
 from pipeline.sequence import Sequence
 
 LATER_STAGES = {
@@ -74,7 +75,7 @@ def read_marker(sequence: Sequence, stage: str) -> StageResult | None:
     try:
         values = files.read_json(path)
         return StageResult(**{k: v for k, v in values.items() if k in StageResult.__dataclass_fields__})
-    except (BadInput, TypeError):
+    except (BadInput, TypeError, AttributeError):
         return None
 
 
@@ -115,7 +116,11 @@ def run_stage(
         retry_failed: run again where the marker says failed.
 
     Returns:
-        The row, which is also in the marker. `DiskFull` is raised: it concerns every item.
+        The row, which is also in the marker.
+
+    Raises:
+        DiskFull: it concerns every item. The stage has no marker then, and is run again.
+        MemoryError: or what C++ calls so; whoever set the limit says what it was.
     """
     mark = fingerprint(stage, config, inputs)
     done = read_marker(sequence, stage)
@@ -135,21 +140,28 @@ def run_stage(
     except DopeError as error:
         result.status, result.reason = "failed", str(error)
     except Exception as error:  # one bad item never stops the rest: it becomes a row with its traceback
+        if is_lack_of_memory(error):
+            raise
         result.status, result.reason = "failed", f"{type(error).__name__}: {error}"
         result.trace = traceback.format_exc(limit=-8)
     sequence.folder.mkdir(parents=True, exist_ok=True)
-    if result.status == "failed" and shutil.disk_usage(sequence.folder).free < FULL_BYTES:
-        # COLMAP and SQLite report a full disk in words of their own; it is no fault of this item
-        raise DiskFull(
-            f"no space left on the disk (stage '{stage}' says: {result.reason})",
-            where=sequence.folder,
-            remedy="Free some space or choose another --out, then run the same command again",
-        )
+    if result.status == "failed":
+        blame_full_disk(sequence, stage, str(result.reason))
     result.seconds = round(time.perf_counter() - start, 3)
     result.cpu_seconds = round(cpu_seconds() - cpu, 3)
     result.peak_memory_mib = round(peak_memory_mib(), 1)
     write_marker(sequence, result)
     return result
+
+
+def blame_full_disk(sequence: Sequence, stage: str, reason: str) -> None:
+    """Raise `DiskFull` where a stage failed on a full disk: COLMAP and SQLite report that in words of their own."""
+    if shutil.disk_usage(sequence.folder).free < FULL_BYTES:
+        raise DiskFull(
+            f"no space left on the disk (stage '{stage}' says: {reason})",
+            where=sequence.folder,
+            remedy="Free some space or choose another --out, then run the same command again",
+        )
 
 
 def write_marker(sequence: Sequence, result: StageResult) -> None:

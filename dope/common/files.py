@@ -77,6 +77,21 @@ def replace_folder(new: Path, path: Path) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
+def clear_leftovers(folder: Path) -> None:
+    """Remove what killed processes left half-written in `folder`; bring back a folder that was just being replaced.
+
+    Only for a folder that nothing else writes to, e.g. under a lock.
+    """
+    for path in sorted(folder.glob(f".*{TEMPORARY}*")):
+        whole = folder / path.name[1:].rsplit(".", 3)[0]  # ".images.123.partial.old" was "images"
+        if path.name.endswith(f"{TEMPORARY}.old") and not whole.exists():
+            path.replace(whole)
+        elif path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+
+
 def write_bytes(path: Path, data: bytes) -> None:
     """Write `data` atomically."""
     with atomic_path(path) as partial:
@@ -94,6 +109,8 @@ def read_json(path: Path) -> Any:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise BadInput("no such file", where=path) from None
+    except OSError as error:
+        raise BadInput(f"cannot be read ({error.strerror})", where=path) from error
     except (ValueError, UnicodeDecodeError) as error:
         raise BadInput(f"is not valid JSON ({error})", where=path, remedy="Delete it and run again") from error
 

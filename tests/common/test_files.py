@@ -40,6 +40,20 @@ def test_atomic_folder_replaces_the_old_one(tmp_path) -> None:
     assert [p.name for p in folder.iterdir()] == ["second"]
 
 
+def test_what_killed_runs_left_is_cleared_and_what_they_replaced_comes_back(tmp_path) -> None:
+    """A kill between the two renames of a replacement leaves the old folder under its temporary name."""
+    (tmp_path / ".images.7.partial.old").mkdir()
+    (tmp_path / ".images.7.partial.old/a.jpg").write_text("old")
+    (tmp_path / ".images.7.partial").mkdir()
+    (tmp_path / "masks").mkdir()
+    (tmp_path / ".masks.8.partial.old").mkdir()  # killed after both: the new folder is there
+    (tmp_path / ".frames.9.partial.parquet").write_text("half")
+    (tmp_path / ".lock").touch()
+    files.clear_leftovers(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".lock", "images", "masks"]
+    assert (tmp_path / "images/a.jpg").read_text() == "old"
+
+
 def test_damaged_json_is_named(tmp_path) -> None:
     path = tmp_path / "marker.json"
     path.write_text('{"a": ')

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
 from dope.common.errors import BadInput
-from pipeline.children import ChildFailed, Limits, run_in_child
+from pipeline import children
+from pipeline.children import ChildFailed, ChildStopped, Limits, run_in_child
+from pipeline.sequence import Sequence
+from pipeline.stages import read_marker, run_stage
 
 
 def double(x: int, notify) -> int:
@@ -32,6 +38,10 @@ def sleep(notify) -> None:
 
 def eat(notify) -> int:
     return len(bytearray(2 << 30))
+
+
+def eat_in_a_stage(folder: Path, notify) -> None:
+    run_stage(Sequence(folder), "sfm", None, None, lambda: {"n": eat(notify)})
 
 
 def refuse(notify) -> None:
@@ -65,6 +75,38 @@ def test_results_and_notes_come_back() -> None:
 def test_a_dead_child_is_an_error_with_its_cause(work, limits: Limits, message: str) -> None:
     with pytest.raises(ChildFailed, match=message):
         run_in_child(work, limits=limits)
+
+
+def test_lack_of_memory_within_a_stage_names_the_limit_and_leaves_no_marker(tmp_path: Path) -> None:
+    with pytest.raises(ChildFailed, match=r"more than 1 GiB of memory\. Raise --memory-gib and add --retry-failed"):
+        run_in_child(eat_in_a_stage, tmp_path, limits=Limits(memory_gib=1))
+    assert read_marker(Sequence(tmp_path), "sfm") is None
+
+
+def test_what_is_stopped_from_here_is_told_from_what_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(children, "_stopping", threading.Event())
+    with ThreadPoolExecutor() as pool:
+        running = pool.submit(run_in_child, sleep, limits=Limits())
+        time.sleep(0.2)
+        children.stop_children()
+        with pytest.raises(ChildStopped, match="Run the same command again"):
+            running.result(timeout=20)
+
+
+def test_children_that_start_at_once_see_their_own_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+
+    def seen(threads: int) -> set[str | None]:
+        found = set()
+        for _ in range(40):
+            with children._thread_counts_in_environment(threads):
+                time.sleep(1e-4)
+                found.add(os.environ.get("OMP_NUM_THREADS"))
+        return found
+
+    with ThreadPoolExecutor(8) as pool:
+        assert list(pool.map(seen, range(8))) == [{str(threads)} for threads in range(8)]
+    assert "OMP_NUM_THREADS" not in os.environ
 
 
 def test_errors_of_the_work_come_back_as_they_are() -> None:

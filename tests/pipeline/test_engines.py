@@ -88,5 +88,16 @@ def test_a_second_run_is_told_who_holds_the_folder(tmp_path) -> None:
     with pytest.raises(BadInput, match=f"process {other.pid} on"), holding(tmp_path):
         pass
     other.communicate("")
+    half = tmp_path / ".sfm.99.partial"
+    half.mkdir()
     with holding(tmp_path):
+        assert not half.exists()  # nobody else can be writing it
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path) -> None:
+    (tmp_path / "file").write_text("")
+    with (
+        pytest.raises(BadInput, match=r"file/mug: cannot be written to.*choose another WORK"),
+        holding(tmp_path / "file/mug"),
+    ):
         pass

@@ -94,6 +94,20 @@ def test_a_failing_method_leaves_no_depth_behind(sequence: Sequence) -> None:
     assert not sequence.depths.exists()
 
 
+def test_masks_that_were_made_later_do_not_limit_depth(sequence: Sequence) -> None:
+    regions = []
+
+    def look(_: Sequence, frames: list, views: list, *__: object) -> list:
+        regions.append({view.region is None for view in views})
+        return [None] * len(frames)
+
+    info = sequence.read_info()
+    for info.masks_from in ("input", "grabcut", None):
+        sequence.write_info(info)
+        write_depths(sequence, tracks_of(CAMERAS), CONFIG, look)
+    assert regions == [{False}, {True}, {False}]
+
+
 def test_views_without_neighbours_get_no_depth(sequence: Sequence) -> None:
     frames = sequence.read_frames()
     for frame in frames[1:6]:
