@@ -29,33 +29,39 @@ app = typer.Typer(
       4. [bold]dope prep shards[/]      WebDataset tars and a Parquet index, ready for [bold]dope train[/]
 
     Every stage takes --shard-index I --num-shards N (or reads the array variables of Slurm, AWS Batch and
-    Kubernetes), so that N containers can share one WORK folder. Exit code: 0 all ok, 1 some sequences failed and
-    the table says which and why, 2 wrong usage.
+    Kubernetes), so that N containers can share one WORK folder; start a stage when all parts of the one before it
+    have ended. Exit code: 0 all ok, 1 some sequences failed and the table says which and why, 2 wrong usage.
     """,
 )
 
 Work = Annotated[Path, typer.Argument(help="The folder that `dope prep colmap --out` wrote.", show_default=False)]
-Workers = Annotated[int, typer.Option(help="Sequences at a time; 0 = one for each CPU.", rich_help_panel="Running")]
+Workers = Annotated[
+    int, typer.Option(min=0, help="Sequences at a time; 0 = one for each CPU.", rich_help_panel="Running")
+]
 Minutes = Annotated[float, typer.Option(help="Time limit of one sequence.", rich_help_panel="Running")]
 Memory = Annotated[float, typer.Option(help="Memory limit of one sequence, GiB.", rich_help_panel="Running")]
 Threads = Annotated[
     int,
-    typer.Option(help="Native threads in a sequence; only 1 repeats COLMAP to the bit.", rich_help_panel="Running"),
+    typer.Option(
+        min=1, help="Native threads in a sequence; only 1 repeats COLMAP to the bit.", rich_help_panel="Running"
+    ),
 ]
 ShardIndex = Annotated[
-    int | None, typer.Option(help="This container's part, from 0.", show_default=False, rich_help_panel="Array jobs")
+    int | None,
+    typer.Option(min=0, help="This container's part, from 0.", show_default=False, rich_help_panel="Array jobs"),
 ]
 NumShards = Annotated[
-    int | None, typer.Option(help="Number of parts.", show_default=False, rich_help_panel="Array jobs")
+    int | None, typer.Option(min=1, help="Number of parts.", show_default=False, rich_help_panel="Array jobs")
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Do it again even where it is done.")]
 RetryFailed = Annotated[bool, typer.Option("--retry-failed", help="Try the sequences again that failed before.")]
-ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML file of settings.", show_default=False)]
-Settings = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Any setting, e.g. sfm.max_image_size=800.", show_default=False),
-]
 AsJson = Annotated[bool, typer.Option("--json", help="Rows as JSON lines instead of a table.")]
+ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML file of settings.", show_default=False)]
+
+
+def _any_setting(example: str) -> Any:
+    text = f"Any setting, e.g. {example}; a wrong name is answered with the nearest."
+    return typer.Option("--set", metavar="KEY=VALUE", help=text, show_default=False)
 
 
 @app.command()
@@ -82,13 +88,22 @@ def colmap(
     mask_features: Annotated[
         bool, typer.Option("--mask-features", help="Features on the object only: for turntables.")
     ] = False,
-    every: Annotated[int | None, typer.Option(help="Take every k-th frame of a video.", show_default=False)] = None,
-    count: Annotated[int | None, typer.Option(help="Take about this many frames.", show_default=False)] = None,
-    long_side: Annotated[int | None, typer.Option(help="Cap of the long side, pixels.", show_default=False)] = None,
-    matching: Annotated[str | None, typer.Option(help="auto, sequential or exhaustive.", show_default=False)] = None,
-    depth: Annotated[str | None, typer.Option(help="sparse or dense.", show_default=False)] = None,
+    every: Annotated[
+        int | None, typer.Option(min=1, help="Take every k-th frame of a video, or photo.", show_default=False)
+    ] = None,
+    count: Annotated[
+        int | None,
+        typer.Option(min=1, help="Take about this many frames.", show_default="60 of a video, all photos"),
+    ] = None,
+    long_side: Annotated[
+        int | None, typer.Option(min=1, help="Cap of the long side, pixels.", show_default="1024")
+    ] = None,
+    matching: Annotated[
+        str | None, typer.Option(help="auto, sequential, exhaustive or similar.", show_default="auto")
+    ] = None,
+    depth: Annotated[str | None, typer.Option(help="sparse or dense.", show_default="dense")] = None,
     config: ConfigFile = None,
-    set_: Settings = None,
+    set_: Annotated[list[str] | None, _any_setting("sfm.max_image_size=800")] = None,
     workers: Workers = 0,
     threads: Threads = 1,
     minutes: Minutes = 60.0,
@@ -150,7 +165,7 @@ def masks(
     ] = None,
     only: Annotated[list[str] | None, typer.Option("--sequence", help="Only these ids.", show_default=False)] = None,
     config: ConfigFile = None,
-    set_: Settings = None,
+    set_: Annotated[list[str] | None, _any_setting("grabcut.radius=1.0")] = None,
     workers: Workers = 0,
     minutes: Minutes = 60.0,
     memory_gib: Memory = 8.0,
@@ -170,15 +185,22 @@ def masks(
       dope prep masks work --from my_masks/
     """
     from pipeline.console import Display, exit_code, show_rows
+    from pipeline.engines import find_share
     from pipeline.masks import MasksConfig, find_mask_folders
     from pipeline.prepare import add_masks
 
     resolved = _config(MasksConfig, config, {}, set_)
-    chosen = _chosen(work, only, shard_index, num_shards)
-    folders = find_mask_folders(from_, [sequence.id for sequence in chosen]) if from_ else {}
+    share = find_share(shard_index, num_shards)
+    everything = _chosen(work, only)
+    chosen = share.of(everything)
+    # looked up for all, so that every part of an array job reads --from the same way
+    folders = find_mask_folders(from_, [sequence.id for sequence in everything]) if from_ else {}
+    without = [sequence.id for sequence in chosen if from_ and sequence.id not in folders]
     options = _options(workers, 1, minutes, memory_gib, overwrite, retry_failed)
     with Display(len(chosen), "prep masks").showing() as display:
         rows = add_masks(chosen, resolved, folders, options, display)
+    if without:
+        typer.echo(f"{from_} has no folder for {', '.join(without)}: see the table for whose masks they have", err=True)
     show_rows(rows, as_json=as_json)
     raise typer.Exit(exit_code(rows))
 
@@ -187,12 +209,19 @@ def masks(
 def correspond(
     work: Work,
     every: Annotated[
-        int | None, typer.Option(help="Use every k-th frame, by frame number.", show_default=False)
+        int | None,
+        typer.Option(
+            min=1,
+            help="Make a view of every k-th kept frame; of more where fewer than views.min_views=20 would be left.",
+            show_default="3",
+        ),
     ] = None,
-    max_pairs: Annotated[int | None, typer.Option(help="View pairs a sequence.", show_default=False)] = None,
+    max_pairs: Annotated[
+        int | None, typer.Option(min=1, help="Most view pairs of a sequence.", show_default="64")
+    ] = None,
     only: Annotated[list[str] | None, typer.Option("--sequence", help="Only these ids.", show_default=False)] = None,
     config: ConfigFile = None,
-    set_: Settings = None,
+    set_: Annotated[list[str] | None, _any_setting("pairs.max_angle_deg=60")] = None,
     workers: Workers = 0,
     minutes: Minutes = 60.0,
     memory_gib: Memory = 8.0,
@@ -213,11 +242,12 @@ def correspond(
     """
     from pipeline.console import Display, exit_code, show_rows
     from pipeline.correspondences import CorrespondConfig
+    from pipeline.engines import find_share
     from pipeline.prepare import correspond_all
 
     flags = {"views.every": every, "pairs.max_pairs": max_pairs}
     resolved = _config(CorrespondConfig, config, flags, set_)
-    chosen = _chosen(work, only, shard_index, num_shards)
+    chosen = find_share(shard_index, num_shards).of(_chosen(work, only))
     options = _options(workers, 1, minutes, memory_gib, overwrite, retry_failed)
     with Display(len(chosen), "prep correspond").showing() as display:
         rows = correspond_all(chosen, resolved, options, display)
@@ -236,7 +266,7 @@ def shards(
     ] = None,
     val_fraction: Annotated[float | None, typer.Option(help="Share that is held out.", show_default="0.25")] = None,
     config: ConfigFile = None,
-    set_: Settings = None,
+    set_: Annotated[list[str] | None, _any_setting("samples_per_shard=512")] = None,
     verify: Annotated[bool, typer.Option("--verify", help="Check every byte against dataset.json afterwards.")] = False,
     shard_index: ShardIndex = None,
     num_shards: NumShards = None,
@@ -288,18 +318,16 @@ def _options(
     from pipeline.engines import default_workers
     from pipeline.prepare import RunOptions
 
-    if workers < 0 or threads < 1 or minutes <= 0 or memory_gib <= 0:
-        raise UsageError("--workers, --threads, --minutes and --memory-gib must be positive")
+    if minutes <= 0 or memory_gib <= 0:
+        raise UsageError("--minutes and --memory-gib must be positive")
     count = workers or max(1, default_workers() // threads)
     return RunOptions(count, Limits(minutes, memory_gib, threads), overwrite, retry_failed)
 
 
-def _chosen(work: Path, only: list[str] | None, index: int | None, count: int | None) -> list[Sequence]:
-    """The sequences of WORK that this command and this container are about."""
-    from pipeline.engines import find_share
+def _chosen(work: Path, only: list[str] | None) -> list[Sequence]:
+    """The sequences of WORK that this command is about, in all parts of an array job."""
     from pipeline.sequence import find_sequences
 
-    share = find_share(index, count)
     found = list(find_sequences(work))
     if not found:
         raise UsageError("holds no prepared sequence", where=work, remedy="Run `dope prep colmap` first")
@@ -309,4 +337,4 @@ def _chosen(work: Path, only: list[str] | None, index: int | None, count: int | 
             known = ", ".join(sequence.id for sequence in found[:10])
             raise UsageError(f"no sequence {', '.join(unknown)} here (there are {known})", where=work)
         found = [sequence for sequence in found if sequence.id in only]
-    return share.of(found)
+    return found

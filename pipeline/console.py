@@ -19,6 +19,7 @@ from rich.table import Table
 if TYPE_CHECKING:
     from pipeline.stages import StageResult
 
+LOG_WIDTH = 1000
 STYLES = {"ok": "green", "empty": "yellow", "failed": "red"}
 
 
@@ -96,7 +97,8 @@ def show_rows(rows: list[StageResult], *, as_json: bool) -> None:
         for values in rows_as_json(rows):
             sys.stdout.write(json.dumps(values, ensure_ascii=False) + "\n")
         return
-    console = Console(highlight=False)
+    # in a log a row is one line, whatever its length: paths stay whole and can be searched for
+    console = Console(highlight=False, width=None if sys.stdout.isatty() else LOG_WIDTH)
     table = Table(box=None, pad_edge=False, header_style="bold")
     for column in ("sequence", "stage", "status", "seconds"):
         table.add_column(column, no_wrap=column != "sequence", justify="right" if column == "seconds" else "left")
@@ -106,6 +108,8 @@ def show_rows(rows: list[StageResult], *, as_json: bool) -> None:
         seconds = "" if row.skipped else f"{row.seconds:.1f}"
         table.add_row(escape(row.sequence), row.stage, status, seconds, escape(describe(row)))
     console.print(table)
+    if any(row.skipped and row.status == "failed" for row in rows):
+        console.print("What failed before was not tried again; --retry-failed does that.")
 
 
 def exit_code(rows: list[StageResult]) -> int:

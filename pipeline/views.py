@@ -51,7 +51,7 @@ class ViewsConfig:
     """Which frames become views, and how they are cut."""
 
     every: int = 3
-    """Every how many frames of the sequence one becomes a view, by frame number (the paper: 3)."""
+    """Every how many of the kept frames one becomes a view (the paper: 3)."""
     min_views: int = 20
     """Take frames more densely where fewer than this many would be left of a short sequence."""
     size: int = 224
