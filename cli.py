@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -14,6 +15,7 @@ from dope.common.errors import DopeError, UsageError
 from pipeline.commands import app as prep
 
 INTERRUPTED = 130  # what typer makes of Ctrl-C
+FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -87,15 +89,25 @@ def main() -> None:
     try:
         app()
     except DopeError as error:
-        from rich.console import Console
-        from rich.markup import escape
-
-        Console(stderr=True, highlight=False).print(f"[red]error:[/] {escape(str(error))}", soft_wrap=True)
+        _explain(error)
         sys.exit(2 if isinstance(error, UsageError) else 1)
+    except OSError as error:
+        if error.errno not in FORBIDDEN:
+            raise
+        remedy = "Give a folder that you may write to (in a container: one that its user owns)"
+        _explain(DopeError(str(error.strerror).lower(), where=error.filename, remedy=remedy))
+        sys.exit(1)
     except SystemExit as end:
         if end.code == INTERRUPTED:
             typer.echo("interrupted; run the same command again to go on", err=True)
         raise
+
+
+def _explain(error: DopeError) -> None:
+    from rich.console import Console
+    from rich.markup import escape
+
+    Console(stderr=True, highlight=False).print(f"[red]error:[/] {escape(str(error))}", soft_wrap=True)
 
 
 if __name__ == "__main__":

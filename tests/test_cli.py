@@ -82,12 +82,21 @@ def test_wrong_usage_is_explained(words: tuple[str, ...], message: str, tmp_path
     assert not (ROOT / "w").exists() and not (ROOT / "run").exists()
 
 
-def test_ctrl_c_says_how_to_go_on(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    def interrupted() -> None:
-        raise KeyboardInterrupt
+@pytest.mark.parametrize(
+    ("error", "code", "message"),
+    [
+        (KeyboardInterrupt(), 130, "interrupted; run the same command again to go on"),
+        (PermissionError(13, "Permission denied", "/mine/work"), 1, "error: /mine/work: permission denied. Give a"),
+    ],
+)
+def test_what_stops_a_command_from_outside_is_explained(
+    error: BaseException, code: int, message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stopped() -> None:
+        raise error
 
-    monkeypatch.setattr("dope.doctor.examine", interrupted)
+    monkeypatch.setattr("dope.doctor.examine", stopped)
     monkeypatch.setattr(sys, "argv", ["dope", "doctor"])
     with pytest.raises(SystemExit) as end:
         cli.main()
-    assert end.value.code == 130 and "run the same command again" in capsys.readouterr().err
+    assert end.value.code == code and message in capsys.readouterr().err
