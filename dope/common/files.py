@@ -22,6 +22,8 @@ def explaining_full_disk(path: Path) -> Iterator[None]:
     """Turn "no space left" (and quota) errors of a block into `DiskFull` naming `path`."""
     try:
         yield
+    except DiskFull as error:  # of a file in a temporary folder, which says nothing to the user
+        raise DiskFull(error.what, where=path, remedy=error.remedy) from error
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise DiskFull(

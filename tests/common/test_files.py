@@ -28,6 +28,9 @@ def test_a_full_disk_is_explained_and_keeps_what_was_there(tmp_path) -> None:
     (folder / "old").write_text("old")
     with pytest.raises(DiskFull, match=r"dataset.*Free some space"), files.atomic_folder(folder):
         raise OSError(errno.ENOSPC, "No space left on device")
+    with pytest.raises(DiskFull) as caught, files.atomic_folder(folder) as partial, files.atomic_path(partial / "new"):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert caught.value.where == str(folder), "not a file of the temporary folder"
     assert (folder / "old").read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["dataset"]
 
