@@ -87,6 +87,10 @@ def find_sources(
         except BadInput as error:
             errors.append((_name(path), path, error))
             continue
+        except OSError as error:  # a folder below that may not be read
+            unreadable = BadInput(f"cannot be read ({error.strerror})", where=error.filename or path)
+            errors.append((_name(path), path, unreadable))
+            continue
         for source in sources:
             place = source.path.resolve()
             if place not in seen:  # the same video given twice is one sequence
@@ -149,10 +153,11 @@ def _expand(path: Path, above: set[Path], *, top: bool) -> Iterator[Source]:
             raise BadInput("is neither a video nor a folder of photos", where=path, remedy=remedy)
         yield _source(path, "video")
         return
-    try:
-        entries = sorted((p for p in path.iterdir() if not p.name.startswith(".")), key=natural_order)
-    except OSError as error:
-        raise BadInput(f"cannot be read ({error.strerror})", where=path) from error
+    if (path / "sequence.json").is_file():  # WORK lies among the inputs: what was made of them is none of them
+        if top:
+            raise BadInput("is a prepared sequence", where=path, remedy="Give the video or photos that it was made of")
+        return
+    entries = sorted((p for p in path.iterdir() if not p.name.startswith(".")), key=natural_order)
     images = path / "images"
     if images.is_dir() and list_photos(images):
         yield _source(images, "photos")

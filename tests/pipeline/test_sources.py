@@ -83,6 +83,27 @@ def test_bad_inputs_are_rows_and_the_others_go_on(tmp_path: Path) -> None:
         assert part in text and str(tmp_path) in text
 
 
+def test_a_work_folder_among_the_inputs_is_none_of_them(tmp_path: Path) -> None:
+    touch(tmp_path / "phone.mp4")
+    prepared = photo_folder(tmp_path / "work/phone/images").parent
+    (prepared / "sequence.json").write_text("{}")
+    assert ids(tmp_path) == ["phone"]
+    sources, ((name, _, error),) = find_sources([prepared])
+    assert not sources and name == "phone" and "is a prepared sequence" in str(error)
+
+
+def test_a_folder_that_may_not_be_read_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    good, closed = touch(tmp_path / "good.mp4"), photo_folder(tmp_path / "in/images")
+
+    def forbidden(folder: Path) -> list[Path]:
+        raise PermissionError(13, "Permission denied", str(folder))
+
+    monkeypatch.setattr("pipeline.sources.list_photos", forbidden)
+    sources, ((name, path, error),) = find_sources([tmp_path / "in", good])
+    assert [s.id for s in sources] == ["good"] and (name, path) == ("in", tmp_path / "in")
+    assert str(closed) in str(error) and "Permission denied" in str(error)
+
+
 def test_a_link_to_a_folder_above_ends(tmp_path: Path) -> None:
     touch(tmp_path / "a/1.mp4")
     (tmp_path / "a/loop").symlink_to(tmp_path)
