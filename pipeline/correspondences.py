@@ -7,6 +7,7 @@ A pixel of view 1 is lifted by its depth, projected into view 2, must lie on the
 from __future__ import annotations
 
 import functools
+import hashlib
 from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
@@ -202,9 +203,18 @@ def correspond(sequence: Sequence, config: CorrespondConfig) -> dict[str, Any]:
         rows_table = pa.Table.from_pylist(table, PAIR_SCHEMA)
         pq.write_table(rows_table, partial, row_group_size=ROW_GROUP, use_dictionary=False)  # coordinates do not repeat
     details |= pair_details
+    details["content"] = _content_of(sequence)
     if not table:
         details["empty"] = _why_empty(details)
     return details
+
+
+def _content_of(sequence: Sequence) -> str:
+    """Identifies what was written, for the stage that packs it: names and bytes of the tables and views."""
+    digest = hashlib.sha256()
+    for path in (views_table(sequence), sequence.correspondences, *sorted(sequence.views.iterdir())):
+        digest.update(f"{path.name}\0{files.sha256_of(path)}\0".encode())
+    return digest.hexdigest()[:32]
 
 
 def _write_table(sequence: Sequence, rows: list[dict[str, Any]]) -> None:

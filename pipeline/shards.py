@@ -239,7 +239,9 @@ def _usable(sequences: list[Sequence]) -> tuple[list[SequenceContents], list[lis
                 left_out[sequence.id] = str(error)
                 continue
             contents.append(found)
-            marks.append([sequence.id, marker.fingerprint, found.category, found.instance])
+            # the content, too: the same settings may have given something else (another version, more threads)
+            content = marker.details.get("content")
+            marks.append([sequence.id, marker.fingerprint, content, found.category, found.instance])
     return contents, marks, left_out
 
 

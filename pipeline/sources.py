@@ -145,7 +145,7 @@ def folder_fingerprint(folder: Path) -> str:
 def _expand(path: Path, above: set[Path], *, top: bool) -> Iterator[Source]:
     """The sources at or below `path`. Raises `BadInput` where the path given by the user (`top`) holds none."""
     if not path.exists():
-        raise BadInput("no such file or folder", where=path)
+        raise BadInput("no such file or folder", where=path, remedy="Check how it is spelt")
     if path.is_file():
         if path.suffix.lower() not in VIDEO_SUFFIXES:
             known = ", ".join(sorted(suffix[1:] for suffix in VIDEO_SUFFIXES))

@@ -223,6 +223,23 @@ def test_what_is_there_is_not_written_again(sequences: list[Sequence], tmp_path:
     assert verify_shards(out)["samples"] == len(rows_of(out)) + len(rows_of(out, "views.parquet"))
 
 
+def test_what_was_made_again_with_other_content_is_packed_again(work: Path, tmp_path: Path) -> None:
+    bell = Sequence(Path(shutil.copytree(work / "bell", tmp_path / "bell")))
+    out = tmp_path / "out"
+
+    def again() -> bool:
+        run_stage(bell, "correspond", CORRESPOND, "", lambda: correspond(bell, CORRESPOND), overwrite=True)
+        return not write_shards([bell], out, CONFIG)["skipped"]
+
+    assert again() and not again(), "the same content is the same dataset"
+    frame = bell.read_frames()[4]
+    mask = bell.read_mask(frame)
+    assert mask is not None
+    mask[: mask.shape[0] // 2] = False
+    bell.write_mask(frame, mask)
+    assert again()
+
+
 def test_holding_out_whole_objects(sequences: list[Sequence], tmp_path: Path) -> None:
     details = write_shards(sequences, tmp_path / "out", replace(CONFIG, holdout="sequences", val_fraction=0.4))
     split_of = {row["sequence"]: row["split"] for row in rows_of(tmp_path / "out")}
