@@ -14,6 +14,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import pyarrow.parquet as pq
 from rich.console import Console
 
 from dope.common import files
@@ -64,7 +65,7 @@ def run_demo(out: Path, *, workers: int = 0, tiny: bool = False) -> None:
     def dope(*words: object, allow_failed_items: bool = False) -> None:
         command = ["dope", *map(str, words)]
         say(f"[bold]{shlex.join(command)}[/]")
-        code = subprocess.run([sys.executable, "-m", "cli", *command[1:]], check=False).returncode
+        code = _run([sys.executable, "-m", "cli", *command[1:]])
         if code == 1 and allow_failed_items:
             say("[yellow]some objects failed (see the table above); the demo goes on without them[/]")
         elif code:
@@ -91,18 +92,37 @@ def run_demo(out: Path, *, workers: int = 0, tiny: bool = False) -> None:
         dope("prep", "masks", work, *base, allow_failed_items=True)
         dope("prep", "correspond", work, "--every", 1, *base, allow_failed_items=True)
         holdout = ("--holdout", "frames") if part == "train" else ("--holdout", "none")
-        dope("prep", "shards", work, "--out", out / f"shards-{part}", *holdout)
+        dope("prep", "shards", work, "--out", out / f"shards-{part}", *holdout, allow_failed_items=True)
 
     run, shards, novel = out / "run", out / "shards-train", out / "shards-novel"
     settings = [word for setting in plan.train for word in ("--set", setting)]
     dope("train", shards, "--out", run, "--preset", "nano", *settings)
     dope("eval", run, novel, "--ways", plan.ways, "--shots", 1, "--queries", plan.queries,
          "--episodes", plan.episodes, "--compare-untrained")  # fmt: skip
-    for dataset, names in ((shards, plan.films.training_families), (novel, plan.films.novel_families)):
-        shown = [word for name in names for word in ("--sequence", f"{name}_0")]
+    for dataset in (shards, novel):
+        shown = [word for name in _one_of_each_family(dataset) for word in ("--sequence", name)]
         for kind in ("colouring", "heatmap"):
             dope("figure", run, dataset, "--kind", kind, *shown, "--masks", "given", "--out", out / "figures")
     _summary(console, out, time.monotonic() - start)
+
+
+def _run(command: list[str]) -> int:
+    """Run a command; Ctrl-C reaches it as well, and it is given the time to leave a checkpoint."""
+    with subprocess.Popen(command) as process:
+        try:
+            return process.wait()
+        except KeyboardInterrupt:
+            process.wait(timeout=120)
+            raise
+
+
+def _one_of_each_family(shards: Path) -> list[str]:
+    """The first sequence of each category that came as far as the shards."""
+    table = pq.read_table(shards / "views.parquet", columns=["category", "sequence"]).to_pylist()
+    first: dict[str, str] = {}
+    for row in sorted(table, key=lambda row: row["sequence"]):
+        first.setdefault(row["category"], row["sequence"])
+    return list(first.values())
 
 
 def _summary(console: Console, out: Path, seconds: float) -> None:
@@ -115,7 +135,9 @@ def _summary(console: Console, out: Path, seconds: float) -> None:
             f"  held-out views: the right pixel found for [bold]{last['pck']:.1%}[/] of the points "
             f"(PCK; untrained network {first['pck']:.1%})"
         )
-    for row in files.read_json(out / "run" / "eval" / "results.json"):
+    rows = files.read_json(out / "run" / "eval" / "results.json")
+    newest = max(row["step"] or 0 for row in rows)  # a run that was trained on keeps its earlier scores, too
+    for row in (row for row in rows if row["step"] in (None, newest)):
         console.print(
             f"  {row['ways']}-way {row['shots']}-shot on families never trained on, {row['network']} network: "
             f"[bold]{row['accuracy']:.1%} ± {row['ci95']:.1%}[/] (chance {row['chance']:.1%})"
