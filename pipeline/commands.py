@@ -129,7 +129,7 @@ def colmap(
     from pipeline.console import Display, exit_code, show_rows
     from pipeline.engines import find_share
     from pipeline.prepare import ColmapConfig, prepare
-    from pipeline.sources import find_sources, input_errors_as_rows
+    from pipeline.sources import find_sources, input_errors_as_rows, known_sources
 
     flags: dict[str, Any] = {
         "frames.every": every,
@@ -141,7 +141,9 @@ def colmap(
     }
     resolved = _config(ColmapConfig, config, flags, set_)
     share = find_share(shard_index, num_shards)
-    sources, errors = find_sources(inputs, category=category, category_from=category_from, masks=masks)
+    sources, errors = find_sources(
+        inputs, category=category, category_from=category_from, masks=masks, known=known_sources(out)
+    )
     options = _options(workers, threads, minutes, memory_gib, overwrite, retry_failed)
     mine = share.of(sources)
     with Display(len(mine), "prep colmap").showing() as display:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -19,7 +19,7 @@ from typing import Any, Literal
 from dope.common import files
 from dope.common.errors import BadInput, UsageError
 from pipeline.photos import PHOTO_SUFFIXES, UNSUPPORTED_PHOTOS, list_photos, natural_order
-from pipeline.sequence import sequence_id
+from pipeline.sequence import find_sequences, sequence_id
 from pipeline.stages import StageResult
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"})
@@ -63,6 +63,7 @@ def find_sources(
     category: str | None = None,
     category_from: str = "none",
     masks: str | None = None,
+    known: Mapping[Path, str] | None = None,
 ) -> tuple[list[Source], list[SourceError]]:
     """The sequences that the paths on a command line stand for, and a row for each path that stands for none.
 
@@ -72,6 +73,7 @@ def find_sources(
         category_from: "parent" takes the name of the folder above the video or capture where `category` is None.
         masks: folder of masks. For one source it is the folder itself, for several `masks`/<id>; a "{}" in it
             stands for the capture's folder or the video's path without its suffix (`{}/masks`, `{}_masks`).
+        known: ids of the sources that WORK holds already (`known_sources`): they keep them, whatever else is given.
 
     Returns:
         Sources with unique ids (the parent's name is prefixed where two are the same), and (id, path, error) rows.
@@ -96,7 +98,7 @@ def find_sources(
             if place not in seen:  # the same video given twice is one sequence
                 seen.add(place)
                 found.append(source)
-    found = [_labelled(source, category, category_from) for source in _with_unique_ids(found)]
+    found = [_labelled(source, category, category_from) for source in _with_unique_ids(found, known or {})]
     if masks is None:
         return found, errors
     kept: list[Source] = []
@@ -108,6 +110,22 @@ def find_sources(
             remedy = "--masks is a folder: for several inputs it holds a folder for each id; {} stands for the input"
             errors.append((source.id, source.path, BadInput("no such folder of masks", where=folder, remedy=remedy)))
     return kept, errors
+
+
+def known_sources(work: Path) -> dict[Path, str]:
+    """The sources of the sequences that WORK holds, where they still are, with their ids.
+
+    A source that has moved is not listed: under its old name it is still the same sequence.
+    """
+    known: dict[Path, str] = {}
+    for sequence in find_sequences(work) if work.is_dir() else ():
+        try:
+            source = Path(sequence.read_info().source)
+        except (BadInput, TypeError):
+            continue  # a damaged sequence.json is written anew
+        if source.exists():
+            known[source.resolve()] = sequence.id
+    return known
 
 
 def input_errors_as_rows(errors: Iterable[SourceError]) -> list[StageResult]:
@@ -200,13 +218,25 @@ def _name(path: Path) -> str:
     return sequence_id(path.name if path.is_dir() else path.stem)
 
 
-def _with_unique_ids(sources: list[Source]) -> list[Source]:
-    """Prefix parents' names until no two ids are equal on any file system, then the file type, then a number."""
+def _with_unique_ids(sources: list[Source], known: Mapping[Path, str]) -> list[Source]:
+    """Prefix parents' names until no two ids are equal on any file system, then the file type, then a number.
+
+    Known sources keep their ids, and nobody else gets one of those.
+    """
+    there = [source for source in sources if source.path.resolve() in known]
+    new = [source for source in sources if source.path.resolve() not in known]
+    named = iter(_unique([*new], {name.casefold() for name in known.values()}))
+    kept = iter(replace(source, id=known[source.path.resolve()]) for source in there)
+    return [next(kept) if source.path.resolve() in known else next(named) for source in sources]
+
+
+def _unique(sources: list[Source], reserved: set[str]) -> list[Source]:
     for level in range(1, 5):
         groups: dict[str, list[int]] = defaultdict(list)
         for index, source in enumerate(sources):
             groups[source.id.casefold()].append(index)
-        clashes = [index for group in groups.values() if len(group) > 1 for index in group]
+        taken_names = [name for name, group in groups.items() if len(group) > 1 or name in reserved]
+        clashes = [index for name in taken_names for index in groups[name]]
         if not clashes:
             return sources
         for index in clashes:
@@ -218,7 +248,7 @@ def _with_unique_ids(sources: list[Source]) -> list[Source]:
             else:
                 name = f"{source.id}_{source.path.suffix[1:] or 'photos'}"
             sources[index] = replace(source, id=sequence_id(name))
-    taken: set[str] = set()
+    taken = set(reserved)
     for index, source in enumerate(sources):
         name, number = source.id, 2
         while name.casefold() in taken:

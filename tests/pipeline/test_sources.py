@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 from tiny_media import encode, pan, texture, write_photos
 
-from pipeline.sources import find_sources, input_errors_as_rows, source_fingerprint
+from pipeline.sequence import Sequence, SequenceInfo
+from pipeline.sources import find_sources, input_errors_as_rows, known_sources, source_fingerprint
 
 PHOTO = encode(texture(16, 16))
 
@@ -149,3 +150,16 @@ def test_the_captures_are_found() -> None:
         pytest.skip("the real captures are not here")
     sources, errors = find_sources([captures])
     assert {s.id for s in sources} >= {"fox", "plush_doll", "skull"} and not errors
+
+
+def test_a_sequence_keeps_its_name_when_inputs_of_the_same_name_join_it(tmp_path: Path) -> None:
+    first, second = touch(tmp_path / "a/mug.mp4"), touch(tmp_path / "b/mug.mp4")
+    work = tmp_path / "work"
+    Sequence(work / "mug").write_info(SequenceInfo("mug", str(first), "video"))
+    assert known_sources(tmp_path / "nowhere") == {}
+    known = known_sources(work)
+    sources, _ = find_sources([second, first], known=known)
+    assert [(source.path, source.id) for source in sources] == [(second, "b_mug"), (first, "mug")]
+    assert [source.id for source in find_sources([second], known=known)[0]] == ["b_mug"]
+    first.unlink()  # moved away: under its name it is still the same sequence
+    assert [source.id for source in find_sources([second], known=known_sources(work))[0]] == ["mug"]
