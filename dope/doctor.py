@@ -56,8 +56,8 @@ REQUIRED = (
 )
 
 OPTIONAL = (
-    ("Blender (bpy)", "bpy", "photoreal renders of meshes (planned)", "an environment of its own: pip install bpy"),
-    ("Ray", "ray", "preparation on a cluster (planned)", "pip install ray"),
+    ("Blender (bpy)", "bpy", "photoreal renders of meshes (planned)", "pip install '.[blender]' (Python 3.11 or 3.13)"),
+    ("Ray", "ray", "preparation on a cluster (planned)", "pip install '.[ray]'"),
 )
 
 
