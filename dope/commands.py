@@ -196,7 +196,7 @@ def _launch(nproc: int) -> int:
 
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(nproc)]
     asked = False
-    # "--", or torchrun takes our --nproc for its own; a process group of its own, or Ctrl-C of a terminal reaches it twice
+    # "--", or torchrun takes our --nproc for its own; its own process group, or Ctrl-C of a terminal reaches it twice
     process = subprocess.Popen([*command, "-m", "--", "cli", *sys.argv[1:]], start_new_session=True)
 
     def hand_on(number: int, frame: object) -> None:
