@@ -15,7 +15,7 @@ from dope.common.errors import DopeError, UsageError
 from pipeline.commands import app as prep
 
 INTERRUPTED = 130  # what typer makes of Ctrl-C
-FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
+NO_PLACE = (errno.EACCES, errno.EPERM, errno.EROFS, errno.EEXIST, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLONG)
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -24,19 +24,15 @@ app = typer.Typer(
 
     [bold]The tour[/], from a folder of phone videos to a score:
 
-      dope prep colmap videos/ --out work     frames, cameras and depth
+      dope prep run videos/ --out work --shards shards    frames, cameras, depth, masks, pixel matches, tars
 
-      dope prep masks work                    the object in every frame
+      dope prep report work --out report.html             what came out, on one page
 
-      dope prep correspond work               views, pairs, pixel matches
+      dope train shards --out run                         a network of descriptors
 
-      dope prep shards work --out shards      WebDataset tars and an index
+      dope eval run shards                                low-shot accuracy
 
-      dope train shards --out run             a network of descriptors
-
-      dope eval run shards                    low-shot accuracy
-
-      dope figure run shards                  same parts, same colours
+      dope figure run shards                              same parts, same colours
 
     [bold]dope demo[/] does all of it, in minutes, on objects that it makes itself.
     [bold]dope doctor[/] says what is installed and what is missing.
@@ -92,9 +88,9 @@ def main() -> None:
         _explain(error)
         sys.exit(2 if isinstance(error, UsageError) else 1)
     except OSError as error:
-        if error.errno not in FORBIDDEN:
+        if error.errno not in NO_PLACE:
             raise
-        remedy = "Give a folder that you may write to (in a container: one that its user owns)"
+        remedy = "Give a path in a folder that you may write to (in a container: one that its user owns)"
         _explain(DopeError(str(error.strerror).lower(), where=error.filename, remedy=remedy))
         sys.exit(1)
     except SystemExit as end:

@@ -19,7 +19,7 @@ import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
@@ -49,13 +49,29 @@ class ChildStopped(ChildFailed):
     """The child was ended from here (Ctrl-C) before it was done; that says nothing of its item."""
 
 
-_stopping = threading.Event()
+class StopSign:
+    """A flag that wakes everybody who waits for it: once shown, `wait([..., sign.fileno()])` returns at once."""
+
+    def __init__(self) -> None:
+        self._seen, self._shown = os.pipe()
+        self.is_shown = False
+
+    def fileno(self) -> int:
+        return self._seen
+
+    def show(self) -> None:
+        if not self.is_shown:
+            self.is_shown = True
+            os.write(self._shown, b"!")
+
+
+_stop_sign = StopSign()
 _environment = threading.Lock()
 
 
 def stop_children() -> None:
     """End all running children: their callers get `ChildStopped`. For Ctrl-C; there is no way back."""
-    _stopping.set()
+    _stop_sign.show()
 
 
 def run_in_child(work: Callable[..., Any], *args: Any, limits: Limits, notify: Notify | None = None) -> Any:
@@ -90,11 +106,10 @@ def run_in_child(work: Callable[..., Any], *args: Any, limits: Limits, notify: N
 def _listen(receiver: Connection, child: Any, limits: Limits, notify: Notify | None, log: Path) -> Any:
     deadline = time.monotonic() + limits.minutes * 60
     while True:
-        if not receiver.poll(max(0.0, min(0.5, deadline - time.monotonic()))):
-            if _stopping.is_set():
-                raise ChildStopped("was stopped before it was done", remedy="Run the same command again to go on")
-            if time.monotonic() < deadline:
-                continue
+        ready = wait([receiver, _stop_sign.fileno()], timeout=max(0.0, deadline - time.monotonic()))
+        if _stop_sign.is_shown:
+            raise ChildStopped("was stopped before it was done", remedy="Run the same command again to go on")
+        if receiver not in ready:
             raise ChildFailed(
                 f"took longer than {limits.minutes:g} minutes and was stopped",
                 remedy="Raise --minutes and add --retry-failed, or use fewer or smaller frames (--count, --long-side)",

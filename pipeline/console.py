@@ -78,9 +78,11 @@ def describe(row: StageResult) -> str:
         "frames": "{kept} of {frames} frames kept",
         "sfm": "{n_registered} of {n_frames} frames registered, {n_points} points, {mean_error_px:.2f} px, by {rung}",
         "depth": "{coverage:.0%} of the pixels, {sparse_within_2_percent:.0%} within 2% of the points",
-        "masks": "{masks} masks from {from}, {missing} missing, {empty} empty",
+        "masks": "{masks} masks from {from}, {missing} missing, {empty} empty, {flagged} flagged",
         "correspond": "{pairs} pairs of {views} views, {median_correspondences:.0f} points a pair",
     }
+    if row.stage == "sfm" and "mean_error_px" not in row.details:  # given cameras and given points: nothing was matched
+        wanted["sfm"] = "{n_registered} of {n_frames} frames with cameras, {n_points} points, {rung}"
     try:
         text = wanted[row.stage].format(**row.details)
     except (KeyError, ValueError, TypeError):  # a stage that reports other figures is still a row
@@ -92,11 +94,13 @@ def describe(row: StageResult) -> str:
 def show_rows(rows: list[StageResult], *, as_json: bool) -> None:
     """Print the rows: a table, failures last where they are seen, or JSON lines."""
     if as_json:
-        from pipeline.prepare import rows_as_json
+        from pipeline.tasks import rows_as_json
 
         for values in rows_as_json(rows):
             sys.stdout.write(json.dumps(values, ensure_ascii=False) + "\n")
         return
+    from pipeline.report.status_text import printable
+
     # in a log a row is one line, whatever its length: paths stay whole and can be searched for
     console = Console(highlight=False, width=None if sys.stdout.isatty() else LOG_WIDTH)
     table = Table(box=None, pad_edge=False, header_style="bold")
@@ -106,7 +110,7 @@ def show_rows(rows: list[StageResult], *, as_json: bool) -> None:
     for row in sorted(rows, key=lambda row: row.status == "failed"):
         status = f"[{STYLES[row.status]}]{row.status}[/]" + (" [dim](done before)[/]" if row.skipped else "")
         seconds = "" if row.skipped else f"{row.seconds:.1f}"
-        table.add_row(escape(row.sequence), row.stage, status, seconds, escape(describe(row)))
+        table.add_row(escape(row.sequence), row.stage, status, seconds, escape(printable(describe(row))))
     console.print(table)
     if any(row.skipped and row.status == "failed" for row in rows):
         console.print("What failed before was not tried again; --retry-failed does that.")

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import fcntl
 import os
+import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import IO, TypeVar
 
 from dope.common import files
 from dope.common.errors import BadInput, UsageError
@@ -55,7 +56,7 @@ def find_share(index: int | None, count: int | None, environment: Mapping[str, s
             raise UsageError("--shard-index and --num-shards go together")
         return Share(index, count)
     if "SLURM_ARRAY_TASK_ID" in env:
-        start, step = int(env.get("SLURM_ARRAY_TASK_MIN", "0")), int(env.get("SLURM_ARRAY_TASK_STEP", "1"))
+        start, step = _number(env, "SLURM_ARRAY_TASK_MIN", "0"), _number(env, "SLURM_ARRAY_TASK_STEP", "1")
         index = (_number(env, "SLURM_ARRAY_TASK_ID") - start) // max(step, 1)
         return Share(index, _count(env, "SLURM_ARRAY_TASK_COUNT"))
     if "AWS_BATCH_JOB_ARRAY_INDEX" in env:
@@ -65,11 +66,12 @@ def find_share(index: int | None, count: int | None, environment: Mapping[str, s
     return Share()
 
 
-def _number(env: Mapping[str, str], name: str) -> int:
+def _number(env: Mapping[str, str], name: str, otherwise: str = "") -> int:
+    text = env.get(name, otherwise)
     try:
-        return int(env[name])
+        return int(text)
     except ValueError:
-        raise UsageError(f"'{env[name]}' is not a number", where=name) from None
+        raise UsageError(f"'{text}' is not a number", where=name) from None
 
 
 def _count(env: Mapping[str, str], name: str) -> int:
@@ -121,20 +123,71 @@ def holding(folder: Path) -> Iterator[None]:
         remedy = "Check its permissions, or choose another WORK"
         raise BadInput(f"cannot be written to ({error.strerror})", where=folder, remedy=remedy) from error
     with file as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            lock.seek(0)
-            holder = lock.read().strip() or "another process"
-            raise BadInput(
-                f"is being worked on by {holder}", where=folder, remedy="Wait for it, or stop it, then run again"
-            ) from None
-        with suppress(OSError):  # who holds it is a courtesy; a full disk is the stage's to report
-            os.ftruncate(lock.fileno(), 0)
-            os.write(lock.fileno(), f"process {os.getpid()} on {os.uname().nodename}".encode())
+        _take(lock, folder)
         for place in (folder, folder / "stages"):
             files.clear_leftovers(place)
         yield
+
+
+def _take(lock: IO[str], what: Path, *, wait: bool = False) -> None:
+    """Lock an open lock file and note who holds it. Raises `BadInput` naming the holder, unless told to wait."""
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except BlockingIOError:
+        lock.seek(0)
+        holder = lock.read().strip() or "another process"
+        remedy = "Wait for it, or stop it, then run again"
+        raise BadInput(f"is being worked on by {holder}", where=what, remedy=remedy) from None
+    with suppress(OSError):  # who holds it is a courtesy; a full disk is the stage's to report
+        os.ftruncate(lock.fileno(), 0)
+        os.write(lock.fileno(), f"process {os.getpid()} on {os.uname().nodename}".encode())
+
+
+@contextmanager
+def holding_output(out: Path, *, wait: bool = False) -> Iterator[None]:
+    """Hold a folder that will be replaced as a whole, by a lock file beside it that is removed at the end.
+
+    Clears what killed runs left of it.
+
+    Raises:
+        BadInput: another process writes it, and this one is not to wait.
+    """
+    path = out.with_name(f".{out.name}.lock")
+    while True:
+        with files.explaining_full_disk(out):
+            out.parent.mkdir(parents=True, exist_ok=True)
+            file = path.open("a+")
+        with file as lock:
+            _take(lock, out, wait=wait)
+            if not _is_at(lock, path):
+                continue  # who held it before has just removed it
+            try:
+                files.clear_leftovers(out.parent, of=out.name)
+                yield
+            finally:
+                path.unlink(missing_ok=True)
+            return
+
+
+def _is_at(file: IO[str], path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except FileNotFoundError:
+        return False
+
+
+@contextmanager
+def interrupted_by_sigterm() -> Iterator[None]:
+    """Make SIGTERM what Ctrl-C is: running children are ended and the command says how to go on."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def default_workers() -> int:

@@ -6,24 +6,27 @@ widen them; `shards.write_shards` packs them. Each sequence works in a child pro
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
-from dope.common.errors import BadInput, DiskFull, DopeError
+from dope.common import settings
+from dope.common.errors import BadInput, UsageError
 from pipeline import stages
-from pipeline.children import ChildFailed, ChildStopped, Limits, Notify, run_in_child
-from pipeline.correspondences import CorrespondConfig, correspond
-from pipeline.engines import holding, run_items
-from pipeline.frames import FramesConfig, extract_frames
-from pipeline.masks import MasksConfig, import_masks, restore_input_masks
-from pipeline.mvs import DepthConfig, compute_depth
+from pipeline.cameras.project import keep_project
+from pipeline.cameras.sfm import SfmConfig, reconstruct
+from pipeline.children import Notify
+from pipeline.correspond.match import CorrespondConfig, correspond
+from pipeline.depth.mvs import DepthConfig, compute_depth
+from pipeline.inputs.frames import FramesConfig, before_cameras, extract_frames
+from pipeline.inputs.sources import Source, masks_fingerprint, place_fingerprint, source_fingerprint
+from pipeline.masks.agreement import check_across_views, forget_check, was_checked
+from pipeline.masks.imported import MasksConfig, import_masks, restore_input_masks
 from pipeline.sequence import Sequence
-from pipeline.sfm import SfmConfig, reconstruct
-from pipeline.sources import Source, folder_fingerprint, source_fingerprint
 from pipeline.stages import StageResult, run_stage
+from pipeline.tasks import RunOptions, Task, Unwatched, Watcher, run_tasks
 
 
 @dataclass(frozen=True)
@@ -36,57 +39,11 @@ class ColmapConfig:
     """Features, matching, mapping and what counts as success."""
     depth: DepthConfig = field(default_factory=DepthConfig)
     """Depth maps."""
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """How a stage is run; nothing here changes what comes out."""
-
-    workers: int = 1
-    limits: Limits = field(default_factory=Limits)
-    overwrite: bool = False
-    retry_failed: bool = False
-
-
-class Watcher(Protocol):
-    """What a run tells of itself, from several threads."""
-
-    def started(self, sequence: str) -> None: ...
-
-    def note(self, sequence: str, text: str) -> None: ...
-
-    def finished(self, sequence: str, rows: list[StageResult]) -> None: ...
-
-
-class Unwatched:
-    """A watcher that says nothing."""
-
-    def started(self, sequence: str) -> None:
-        pass
-
-    def note(self, sequence: str, text: str) -> None:
-        pass
-
-    def finished(self, sequence: str, rows: list[StageResult]) -> None:
-        pass
+    masks: MasksConfig = field(default_factory=MasksConfig)
+    """How masks are read that come with the input."""
 
 
 COLMAP_STAGES = ("frames", "sfm", "depth")
-
-
-@dataclass(frozen=True)
-class _Task:
-    """One sequence's work: `plan` says what is expected to be done, `run` does it in a child."""
-
-    folder: Path
-    stages: tuple[str, ...]
-    """In order."""
-    plan: dict[str, str]
-    """Fingerprint of each stage; empty where the input cannot even be read."""
-    run: Callable[..., list[StageResult]]
-    arguments: tuple[Any, ...]
-    refusal: str | None = None
-    """Why nothing may be run."""
 
 
 def prepare(
@@ -101,13 +58,13 @@ def prepare(
     for source in sources:
         folder, plan, inputs, refusal = work / source.id, {}, None, None
         try:
-            inputs = source_fingerprint(source)
-            plan = _colmap_marks(config, inputs)
-            refusal = _other_input(Sequence(folder), source)
+            inputs = colmap_inputs(source, config)
+            plan = colmap_marks(config, inputs)
+            refusal = other_input(Sequence(folder), source)
         except BadInput as error:
             refusal = str(error)
-        tasks.append(_Task(folder, COLMAP_STAGES, plan, _prepare_one, (source, inputs, config), refusal))
-    return _run(tasks, options, watcher or Unwatched())
+        tasks.append(Task(folder, COLMAP_STAGES, plan, prepare_one, (source, inputs, config), refusal))
+    return run_tasks(tasks, options, watcher or Unwatched())
 
 
 def add_masks(
@@ -121,9 +78,10 @@ def add_masks(
     tasks = []
     for sequence in sequences:
         folder = masks.get(sequence.id)
-        plan = {"masks": stages.fingerprint("masks", config, _masks_inputs(sequence, folder))}
-        tasks.append(_Task(sequence.folder, ("masks",), plan, _masks_one, (folder, config)))
-    return _run(tasks, options, watcher or Unwatched())
+        inputs = masks_inputs(_marks(sequence, "frames", "sfm"), folder, config)
+        plan = {"masks": stages.fingerprint("masks", config, inputs)}
+        tasks.append(Task(sequence.folder, ("masks",), plan, mask_one, (folder, config)))
+    return run_tasks(tasks, options, watcher or Unwatched())
 
 
 def correspond_all(
@@ -133,77 +91,11 @@ def correspond_all(
     tasks = []
     for sequence in sequences:
         plan = {"correspond": stages.fingerprint("correspond", config, _marks(sequence, "depth", "masks"))}
-        tasks.append(_Task(sequence.folder, ("correspond",), plan, _correspond_one, (config,)))
-    return _run(tasks, options, watcher or Unwatched())
+        tasks.append(Task(sequence.folder, ("correspond",), plan, correspond_one, (config,)))
+    return run_tasks(tasks, options, watcher or Unwatched())
 
 
-def _run(tasks: list[_Task], options: RunOptions, watcher: Watcher) -> list[StageResult]:
-    def one(task: _Task) -> list[StageResult]:
-        rows = _already_done(task, options)
-        if rows is None and task.refusal is not None:
-            rows = [_failed(task.folder, task.stages[0], task.refusal)]
-        if rows is None:
-            watcher.started(task.folder.name)
-            rows = _in_child(task, options, watcher)
-        watcher.finished(task.folder.name, rows)
-        return rows
-
-    results = run_items(tasks, one, workers=options.workers)
-    return [row for rows in results for row in rows]
-
-
-def _already_done(task: _Task, options: RunOptions) -> list[StageResult] | None:
-    """The rows of a sequence whose markers say that nothing is to be done, read without starting a process."""
-    if options.overwrite or not task.plan:
-        return None
-    rows = []
-    for stage, mark in task.plan.items():
-        row = stages.read_marker(Sequence(task.folder), stage)
-        if row is None or row.fingerprint != mark or (options.retry_failed and row.status == "failed"):
-            return None
-        row.skipped = True
-        rows.append(row)
-        if not row.ok:
-            break
-    return rows
-
-
-def _in_child(task: _Task, options: RunOptions, watcher: Watcher) -> list[StageResult]:
-    started: list[str] = []
-
-    def note(text: str) -> None:
-        stage, _, rest = text.partition(": ")
-        if stage in stages.LATER_STAGES:
-            started.append(stage)
-        watcher.note(task.folder.name, text if rest else stage)
-
-    try:
-        with holding(task.folder):
-            try:
-                rows: list[StageResult] = run_in_child(
-                    task.run, task.folder, *task.arguments, options, limits=options.limits, notify=note
-                )
-            except ChildStopped:
-                raise
-            except ChildFailed as error:  # the child could not write its own marker
-                if not started:  # not even its modules could be loaded: no stage is to blame
-                    raise
-                sequence, stage = Sequence(task.folder), started[-1]
-                stages.blame_full_disk(sequence, stage, str(error))
-                rows = [_failed(task.folder, stage, str(error), task.plan[stage])]
-                stages.write_marker(sequence, rows[0])
-            return rows
-    except DiskFull:
-        raise
-    except DopeError as error:
-        return [_failed(task.folder, started[-1] if started else task.stages[0], str(error))]
-
-
-def _failed(folder: Path, stage: str, reason: str, mark: str = "") -> StageResult:
-    return StageResult(folder.name, stage, "failed", reason=reason, fingerprint=mark)
-
-
-def _other_input(sequence: Sequence, source: Source) -> str | None:
+def other_input(sequence: Sequence, source: Source) -> str | None:
     """Why a source must not take the place of what WORK/<id> holds: another input, still there, has the same name."""
     try:
         before = Path(sequence.read_info().source)
@@ -215,28 +107,65 @@ def _other_input(sequence: Sequence, source: Source) -> str | None:
     return str(BadInput(f"{sequence.folder} holds the sequence of {before} already", where=source.path, remedy=remedy))
 
 
-def _colmap_marks(config: ColmapConfig, inputs: Any) -> dict[str, str]:
-    frames = stages.fingerprint("frames", config.frames, inputs)
+def colmap_inputs(source: Source, config: ColmapConfig) -> dict[str, Any]:
+    """What the first stage reads: the source, and how its masks are read where it has any."""
+    inputs = source_fingerprint(source)
+    if source.masks is not None:
+        values = settings.to_dict(before_cameras(source, config.masks))
+        later = ("grabcut", "hull", "on_flag")  # what is done without masks, or after the cameras
+        inputs["mask_settings"] = {name: value for name, value in values.items() if name not in later}
+        inputs["coco_images"] = _table_fingerprint(config.masks)
+    return inputs
+
+
+def colmap_marks(config: ColmapConfig, inputs: Any) -> dict[str, str]:
+    """The fingerprints of the stages of `dope prep colmap` on an input."""
+    return marks_from_frames(config, stages.fingerprint("frames", config.frames, inputs))
+
+
+def marks_from_frames(config: ColmapConfig, frames: str) -> dict[str, str]:
+    """The same where the fingerprint of the first stage is known."""
     sfm = stages.fingerprint("sfm", config.sfm, frames)
     return {"frames": frames, "sfm": sfm, "depth": stages.fingerprint("depth", config.depth, sfm)}
 
 
-def _prepare_one(
+def prepare_one(
     folder: Path, source: Source, inputs: Any, config: ColmapConfig, options: RunOptions, notify: Notify
 ) -> list[StageResult]:
+    """Frames, cameras and depth of one source, in a child process: rows up to the first stage that is not ok."""
     sequence = Sequence(folder)
-    marks = _colmap_marks(config, inputs)
+    marks = colmap_marks(config, inputs)
     again: dict[str, Any] = {"overwrite": options.overwrite, "retry_failed": options.retry_failed}
     threads = options.limits.threads
 
+    def frames() -> dict[str, Any]:
+        details = extract_frames(source, sequence, config.frames, config.masks)
+        keep_project(sequence, sequence.read_frames(), None, wanted=config.sfm.keep_database)
+        return details
+
+    def restore() -> None:
+        restore_input_masks(sequence, source.masks, before_cameras(source, config.masks))
+
     def sfm() -> dict[str, Any]:
-        restore_input_masks(sequence, source.masks, MasksConfig())
+        restore()
+        if source.cameras is not None:
+            from pipeline.cameras.known import reuse_cameras
+
+            return reuse_cameras(sequence, source.cameras, replace(config.sfm, threads=threads))
         return reconstruct(sequence, replace(config.sfm, threads=threads))
 
+    def depth() -> dict[str, Any]:
+        bring_input_masks_back(sequence, restore, there=source.masks is not None)
+        if source.depths is not None:
+            from pipeline.depth.imported import import_depth_folder
+
+            return import_depth_folder(sequence, source.depths, replace(config.depth, threads=threads))
+        return compute_depth(sequence, replace(config.depth, threads=threads))
+
     steps: list[tuple[str, Any, Any, Callable[[], dict[str, Any]]]] = [
-        ("frames", config.frames, inputs, lambda: extract_frames(source, sequence, config.frames)),
+        ("frames", config.frames, inputs, frames),
         ("sfm", config.sfm, marks["frames"], sfm),
-        ("depth", config.depth, marks["sfm"], lambda: compute_depth(sequence, replace(config.depth, threads=threads))),
+        ("depth", config.depth, marks["sfm"], depth),
     ]
     rows = []
     for stage, stage_config, stage_inputs, work in steps:
@@ -247,22 +176,57 @@ def _prepare_one(
     return rows
 
 
+def bring_input_masks_back(sequence: Sequence, restore: Callable[[], None], *, there: bool) -> None:
+    """Depth sees the input's masks whole, whatever was dropped or put in their place since.
+
+    The masks stage then has to be run again: its marker goes first, so that a run that is killed here goes on right.
+
+    Args:
+        restore: puts the input's masks back.
+        there: the input has masks. Where it has none, depth reads none.
+    """
+    later = sequence.read_info().masks_are_later
+    if (later and there) or (not later and was_checked(sequence.read_frames())):
+        stages.marker_path(sequence, "masks").unlink(missing_ok=True)
+        restore()
+
+
 def _marks(sequence: Sequence, *names: str) -> dict[str, str | None]:
     """Fingerprints of earlier stages; None where one was not run (its absence is an input, too)."""
     return {name: m.fingerprint if (m := stages.read_marker(sequence, name)) else None for name in names}
 
 
-def _masks_inputs(sequence: Sequence, folder: Path | None) -> dict[str, Any]:
-    files = None if folder is None else folder_fingerprint(folder)
-    return {**_marks(sequence, "frames", "sfm"), "files": files}
+def masks_inputs(marks: Mapping[str, str | None], masks: Path | None, config: MasksConfig) -> dict[str, Any]:
+    """What the masks stage reads: the stages before it by their fingerprints, and the masks to be imported."""
+    return {
+        "frames": marks["frames"],
+        "sfm": marks["sfm"],
+        "files": None if masks is None else masks_fingerprint(masks),
+        "coco_images": _table_fingerprint(config),
+    }
 
 
-def _masks_one(
+def _table_fingerprint(config: MasksConfig) -> str | None:
+    if config.coco_images is None:
+        return None
+    try:
+        return place_fingerprint(Path(config.coco_images))
+    except OSError as error:
+        raise UsageError(f"cannot be read ({error.strerror})", where=config.coco_images) from error
+
+
+def mask_one(
     folder: Path, masks: Path | None, config: MasksConfig, options: RunOptions, notify: Notify
 ) -> list[StageResult]:
+    """The masks stage of one sequence, in a child process."""
     sequence = Sequence(folder)
 
     def work() -> dict[str, Any]:
+        forget_check(sequence)
+        details = masks_of_sequence()
+        return details | check_across_views(sequence, config.hull, config.on_flag)
+
+    def masks_of_sequence() -> dict[str, Any]:
         given = stages.require(sequence, "frames", "dope prep colmap").details.get("masks")
         if masks is not None:
             with _masks_of(sequence, "import"):
@@ -271,13 +235,14 @@ def _masks_one(
             with _masks_of(sequence, "grabcut"):
                 return {"from": "GrabCut", **_grabcut(sequence, config)}
         if sequence.read_info().masks_are_later:
-            remedy = "Name a folder with --from, or bring them back with `dope prep colmap --overwrite`"
-            raise BadInput("the masks given to `dope prep colmap` were replaced since", where=folder, remedy=remedy)
-        return {"from": "given to `dope prep colmap`", **given}
+            remedy = "Name a folder with --from, or bring them back by preparing it again with --overwrite"
+            raise BadInput("the masks that came with the input were replaced since", where=folder, remedy=remedy)
+        return {"from": "the input", **given}
 
     notify("masks: started")
     again: dict[str, Any] = {"overwrite": options.overwrite, "retry_failed": options.retry_failed}
-    return [run_stage(sequence, "masks", config, _masks_inputs(sequence, masks), work, **again)]
+    inputs = masks_inputs(_marks(sequence, "frames", "sfm"), masks, config)
+    return [run_stage(sequence, "masks", config, inputs, work, **again)]
 
 
 @contextmanager
@@ -295,14 +260,15 @@ def _masks_of(sequence: Sequence, whose: Literal["import", "grabcut"]) -> Iterat
 
 
 def _grabcut(sequence: Sequence, config: MasksConfig) -> dict[str, Any]:
-    from pipeline.colmap import read_points
-    from pipeline.grabcut import grabcut_masks
+    from pipeline.cameras.colmap import read_points
+    from pipeline.masks.grabcut import grabcut_masks
 
     stages.require(sequence, "sfm", "dope prep colmap")
     return grabcut_masks(sequence, read_points(sequence), config)
 
 
-def _correspond_one(folder: Path, config: CorrespondConfig, options: RunOptions, notify: Notify) -> list[StageResult]:
+def correspond_one(folder: Path, config: CorrespondConfig, options: RunOptions, notify: Notify) -> list[StageResult]:
+    """The correspond stage of one sequence, in a child process."""
     sequence = Sequence(folder)
 
     def work() -> dict[str, Any]:
@@ -315,8 +281,3 @@ def _correspond_one(folder: Path, config: CorrespondConfig, options: RunOptions,
     notify("correspond: started")
     again: dict[str, Any] = {"overwrite": options.overwrite, "retry_failed": options.retry_failed}
     return [run_stage(sequence, "correspond", config, _marks(sequence, "depth", "masks"), work, **again)]
-
-
-def rows_as_json(rows: list[StageResult]) -> list[dict[str, Any]]:
-    """Rows as plain values, for `--json` and for files."""
-    return [asdict(row) for row in rows]

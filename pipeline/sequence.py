@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from dope.common import files
 from dope.common.errors import BadInput
 from pipeline.geometry import Camera
+from pipeline.inputs.image_size import refuse_huge
 
 FRAME_SCHEMA = pa.schema(
     [
@@ -56,6 +57,9 @@ FRAME_SCHEMA = pa.schema(
         ("depth_scale", pa.float64()),
         ("source_width", pa.int32()),  # of the source image, upright, before any resizing
         ("source_height", pa.int32()),
+        ("focal_px_prior", pa.float64()),  # by the photo's EXIF, pixels of the image as stored; null where unknown
+        ("mask_iou", pa.float64()),  # of the mask and the silhouette of the other views' hull; null where not checked
+        ("mask_flag", pa.string()),  # why the mask is doubted, or null
     ]
 )
 
@@ -86,6 +90,9 @@ class Frame:
     depth_scale: float | None = None
     source_width: int | None = None
     source_height: int | None = None
+    focal_px_prior: float | None = None
+    mask_iou: float | None = None
+    mask_flag: str | None = None
 
     @property
     def camera(self) -> Camera:
@@ -126,6 +133,8 @@ class SequenceInfo:
     licence: str | None = None
     unit: str = "arbitrary"
     """Unit of length: "arbitrary" until the reconstruction is normalised, then "object radius"."""
+    input_scale: float | None = None
+    """Length, in this sequence's unit, of one unit of the cameras as given or reconstructed; None: no cameras."""
     ordered: bool = False
     """True where neighbouring frames are neighbouring views (videos, turntables)."""
     n_frames: int = 0
@@ -247,10 +256,13 @@ class Sequence:
 def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> NDArray[Any]:
     """Decode an image (file names of any alphabet). Raises `BadInput` naming the file."""
     try:
-        data = np.frombuffer(path.read_bytes(), np.uint8)
+        data = path.read_bytes()
+        refuse_huge(data)
     except OSError as error:
         raise BadInput(f"cannot be read ({error.strerror})", where=path) from error
-    image = cv2.imdecode(data, flags) if data.size else None
+    except BadInput as error:
+        raise BadInput(error.what, where=path, remedy=error.remedy) from error
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     if image is None:
         raise BadInput("is not an image that can be decoded", where=path)
     return image

@@ -1,8 +1,8 @@
 """One stage over one sequence: skip what is done, run what is not, and always leave a marker.
 
 The marker WORK/<id>/stages/<stage>.json is written last. It holds the status (ok, empty or failed), the reason, a
-fingerprint of settings and inputs, seconds, peak memory and versions. A stage whose marker has the same fingerprint is
-not run again; the fingerprint of a stage is an input of the next, so a change travels down the line.
+fingerprint of the stage's version, settings and inputs, seconds, peak memory and versions. A stage whose marker has the
+same fingerprint is not run again; the fingerprint of a stage is an input of the next: a change travels down the line.
 """
 
 from __future__ import annotations
@@ -31,6 +31,10 @@ LATER_STAGES = {
     "correspond": (),
 }
 """What must be done again after a stage was run: their markers are removed before it starts."""
+
+STAGE_VERSIONS = {"frames": 2, "sfm": 2, "depth": 1, "masks": 1, "correspond": 2}
+"""Part of each fingerprint. Raise a stage's number by hand in the change that makes it write something else from the
+same input and settings: what an older version wrote is then made again, with all stages after it."""
 
 FULL_BYTES = 8 << 20
 """A disk with less room than this is full: a failure on it is the disk's."""
@@ -90,9 +94,10 @@ def require(sequence: Sequence, stage: str, command: str) -> StageResult:
 
 
 def fingerprint(stage: str, config: Any, inputs: Any) -> str:
-    """Identifies what a stage would do: its settings and the fingerprints of what it reads."""
+    """Identifies what a stage would do: its version, its settings and the fingerprints of what it reads."""
     config_values = settings.to_dict(config) if hasattr(config, "__dataclass_fields__") else config
-    return settings.config_hash({"stage": stage, "config": config_values, "inputs": inputs})
+    version = STAGE_VERSIONS.get(stage, 1)
+    return settings.config_hash({"stage": stage, "version": version, "config": config_values, "inputs": inputs})
 
 
 def run_stage(
@@ -113,7 +118,7 @@ def run_stage(
         work: does the stage and returns its details; raises `BadInput` for input that cannot be used. A detail
             `{"empty": reason}` marks the stage as empty.
         overwrite: run even where the marker is right.
-        retry_failed: run again where the marker says failed.
+        retry_failed: run again where the marker says failed or empty.
 
     Returns:
         The row, which is also in the marker.
@@ -124,7 +129,7 @@ def run_stage(
     """
     mark = fingerprint(stage, config, inputs)
     done = read_marker(sequence, stage)
-    if done and done.fingerprint == mark and not overwrite and not (retry_failed and done.status == "failed"):
+    if done and done.fingerprint == mark and not overwrite and (done.ok or not retry_failed):
         done.skipped = True
         return done
     for name in (*reversed(LATER_STAGES[stage]), stage):

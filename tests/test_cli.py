@@ -21,7 +21,8 @@ def dope(*words: object, **options) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.parametrize(
     "words",
-    [(), ("prep",), ("prep", "colmap"), ("prep", "masks"), ("prep", "correspond"), ("prep", "shards"),
+    [(), ("prep",), ("prep", "run"), ("prep", "colmap"), ("prep", "masks"), ("prep", "correspond"), ("prep", "shards"),
+     ("prep", "status"), ("prep", "report"),
      ("train",), ("eval",), ("figure",), ("demo",), ("doctor",)],
 )  # fmt: skip
 def test_every_command_explains_itself(words: tuple[str, ...]) -> None:
@@ -44,7 +45,7 @@ def test_help_imports_nothing_heavy() -> None:
 
 def test_the_help_is_a_tour() -> None:
     text = dope("--help").stdout
-    tour = ("prep colmap", "prep masks", "prep correspond", "prep shards", "train", "eval", "figure")
+    tour = ("prep run", "prep report", "train", "eval", "figure", "demo", "doctor")
     places = [text.index(f"dope {command}") for command in tour]
     assert places == sorted(places)
 
@@ -87,6 +88,7 @@ def test_wrong_usage_is_explained(words: tuple[str, ...], message: str, tmp_path
     [
         (KeyboardInterrupt(), 130, "interrupted; run the same command again to go on"),
         (PermissionError(13, "Permission denied", "/mine/work"), 1, "error: /mine/work: permission denied. Give a"),
+        (FileExistsError(17, "File exists", "a_file"), 1, "error: a_file: file exists. Give a path"),
     ],
 )
 def test_what_stops_a_command_from_outside_is_explained(

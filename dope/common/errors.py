@@ -15,7 +15,7 @@ class DopeError(Exception):
     """
 
     def __init__(self, what: str, *, where: str | Path | None = None, remedy: str | None = None) -> None:
-        self.what, self.where, self.remedy = what, None if where is None else str(where), remedy
+        self.what, self.where, self.remedy = what, None if where is None else legible(where), remedy
         super().__init__(str(self))
 
     def __str__(self) -> str:
@@ -24,6 +24,11 @@ class DopeError(Exception):
 
     def __reduce__(self) -> tuple[object, ...]:  # keyword-only arguments do not survive the default pickling
         return (_rebuild, (type(self), self.what, self.where, self.remedy))
+
+
+def legible(name: str | Path) -> str:
+    """A file's name as text that can be written anywhere: bytes of it that are no UTF-8 become escapes."""
+    return str(name).encode("utf-8", "backslashreplace").decode()
 
 
 class UsageError(DopeError):

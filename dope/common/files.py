@@ -6,6 +6,7 @@ import errno
 import hashlib
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -79,12 +80,14 @@ def replace_folder(new: Path, path: Path) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
-def clear_leftovers(folder: Path) -> None:
+def clear_leftovers(folder: Path, of: str | None = None) -> None:
     """Remove what killed processes left half-written in `folder`; bring back a folder that was just being replaced.
 
-    Only for a folder that nothing else writes to, e.g. under a lock.
+    Only where nothing else writes, e.g. under a lock: to `folder`, or to the folder named `of` in it.
     """
     for path in sorted(folder.glob(f".*{TEMPORARY}*")):
+        if of is not None and not re.fullmatch(rf"\.{re.escape(of)}\.\d+{re.escape(TEMPORARY)}(\.old)?", path.name):
+            continue
         whole = folder / path.name[1:].rsplit(".", 3)[0]  # ".images.123.partial.old" was "images"
         if path.name.endswith(f"{TEMPORARY}.old") and not whole.exists():
             path.replace(whole)
@@ -129,7 +132,7 @@ def quick_fingerprint(path: Path, chunk: int = 1 << 20) -> str:
     It does not read the modification time, so that a copied input is still the same input.
     """
     size = path.stat().st_size
-    digest = hashlib.sha256(f"{path.name}\0{size}\0".encode())
+    digest = hashlib.sha256(os.fsencode(path.name) + f"\0{size}\0".encode())
     with path.open("rb") as file:
         for start in sorted({0, max(0, size // 2 - chunk // 2), max(0, size - chunk)}):
             file.seek(start)

@@ -70,6 +70,17 @@ def override(config: Config, assignments: Iterable[str]) -> Config:
     return config
 
 
+def require_at_least(config: Any, **least: float) -> None:
+    """Refuse settings that are too small to mean anything; for `__post_init__`.
+
+    Raises:
+        UsageError: names the setting, its value and the least that it may have.
+    """
+    for name, value in least.items():
+        if getattr(config, name) < value:
+            raise UsageError(f"{name} must be at least {value:g}, not {getattr(config, name)}", where="settings")
+
+
 def load_yaml(path: Path) -> dict[str, Any]:
     """Read a YAML mapping. Raises `UsageError` where it is absent, malformed or not a mapping."""
     try:

@@ -73,3 +73,15 @@ def test_files_that_are_not_mappings_are_refused(tmp_path, text: str) -> None:
 def test_hash_changes_with_any_setting_and_only_then() -> None:
     assert config_hash(Outer()) == config_hash(Outer())
     assert config_hash(Outer()) != config_hash(override(Outer(), ["inner.mode=b"]))
+
+
+@pytest.mark.parametrize(
+    "assignment",
+    ["depth.long_side=0", "views.every=0", "views.size=1", "pairs.max_pairs=0", "match.max_points=0"],
+)
+def test_settings_that_mean_nothing_are_refused_by_name(assignment):
+    from pipeline.run import RunConfig
+
+    name = assignment.split("=")[0].split(".")[1]
+    with pytest.raises(UsageError, match=rf"{name} must be at least \d+, not \d"):
+        override(RunConfig(), [assignment])

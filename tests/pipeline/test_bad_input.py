@@ -21,14 +21,15 @@ import pytest
 from tiny_media import encode, index_first, pan, write_photos, write_video
 
 from dope.common import files
-from pipeline import prepare
-from pipeline.console import describe
-from pipeline.masks import MasksConfig
-from pipeline.model_checks import split_warning
-from pipeline.prepare import ColmapConfig, RunOptions, add_masks
+from pipeline import prepare, tasks
+from pipeline.cameras.model_checks import split_warning
+from pipeline.console import describe, show_rows
+from pipeline.inputs.sources import find_sources, input_errors_as_rows
+from pipeline.masks.imported import MasksConfig
+from pipeline.prepare import ColmapConfig, add_masks
 from pipeline.sequence import Sequence
-from pipeline.sources import find_sources, input_errors_as_rows
 from pipeline.stages import StageResult
+from pipeline.tasks import RunOptions
 
 ROOT = Path(__file__).parents[2]
 
@@ -36,7 +37,7 @@ ROOT = Path(__file__).parents[2]
 @pytest.fixture(autouse=True)
 def only_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     """In this process, and without cameras and depth: what is bad here shows before them."""
-    monkeypatch.setattr(prepare, "run_in_child", lambda work, *args, limits, notify: work(*args, notify))
+    monkeypatch.setattr(tasks, "run_in_child", lambda work, *args, limits, notify: work(*args, notify))
     for name in ("reconstruct", "compute_depth"):
         monkeypatch.setattr(prepare, name, lambda *_: {})
 
@@ -181,7 +182,7 @@ BAD_MASKS: list[Any] = [
 
 @pytest.mark.parametrize(
     ("damage", "name", "what", "remedy"),
-    [*BAD_MASKS, (no_masks, "shots", "no such folder of masks", "holds a folder for each id")],
+    [*BAD_MASKS, (no_masks, "shots", "no such file or folder of masks", "holds a file or folder for each id")],
 )
 def test_bad_masks_given_to_colmap(
     damage: Callable[[Path], None], name: str, what: str, remedy: str, masks: Path, tmp_path: Path
@@ -256,3 +257,36 @@ def test_a_full_disk_is_named_and_the_work_goes_on_when_there_is_room(tmp_path: 
     assert "no space left on the disk" in said and str(disk / "work") in said and "Free some space" in said
     assert "Traceback" not in said and "frames.json" not in said and "partial" not in said
     assert files.json.loads(answer.stdout.splitlines()[0])["status"] == "ok", "the frames are taken now"
+
+
+def test_a_row_is_one_line_whatever_the_names_in_it(capsys: pytest.CaptureFixture[str]) -> None:
+    name = "in/new\nline \x1b[31m\udcff<b>"  # the last but one: a byte of a name that is no UTF-8
+    show_rows([StageResult("a", "frames", "failed", reason=f"{name}: gone")], as_json=False)
+    (row,) = capsys.readouterr().out.splitlines()[1:]
+    assert row.rstrip().endswith(r"in/new\nline \x1b[31m\udcff<b>: gone")
+
+
+def renamed(place: Path, name: bytes) -> Path:
+    """A file or folder under another name, which need not be UTF-8."""
+    new = Path(os.fsdecode(os.fsencode(place.parent) + b"/" + name))
+    try:
+        return place.rename(new)
+    except OSError:
+        pytest.skip("this file system takes UTF-8 names only")
+
+
+def test_a_name_that_is_no_utf8_is_a_row_and_the_others_go_on(tmp_path: Path) -> None:
+    video = renamed(write_video(tmp_path / "raw/film.mp4", pan(8)), b"f\xfflm.mp4")
+    (bad,), (good, *_) = prep(tmp_path, video)
+    assert good.ok and bad.sequence == "f_lm" and bad.reason is not None
+    assert bad.reason.endswith(r"raw/f\udcfflm.mp4: its name is not UTF-8. Rename it")
+
+
+def test_a_photo_with_a_name_that_is_no_utf8_is_dropped(tmp_path: Path) -> None:
+    folder = write_photos(tmp_path / "shots", pan(8))
+    renamed(folder / "IMG_0003.jpg", b"caf\xe9.jpg")
+    (row, *_), _ = prep(tmp_path, folder)
+    frames = Sequence(tmp_path / "work/shots").read_frames()
+    assert row.ok and [(f.source_name, f.dropped) for f in frames if f.dropped] == [
+        (r"caf\udce9.jpg", "its name is not UTF-8")
+    ]

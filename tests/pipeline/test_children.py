@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -84,7 +83,7 @@ def test_lack_of_memory_within_a_stage_names_the_limit_and_leaves_no_marker(tmp_
 
 
 def test_what_is_stopped_from_here_is_told_from_what_failed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(children, "_stopping", threading.Event())
+    monkeypatch.setattr(children, "_stop_sign", children.StopSign())
     with ThreadPoolExecutor() as pool:
         running = pool.submit(run_in_child, sleep, limits=Limits())
         time.sleep(0.2)

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from dope.common.errors import BadInput
-from pipeline import colmap
+from pipeline.cameras import colmap
+from pipeline.cameras.colmap.base import pycolmap
+from pipeline.cameras.colmap.model import _opencv_intrinsics
 
 ROOT = Path(__file__).parents[2]
 
@@ -23,7 +25,7 @@ def run_python(code: str) -> subprocess.CompletedProcess[str]:
 def test_zlib_survives_pycolmap():
     """If pycolmap's own deflate symbols win, compressing aborts the process."""
     done = run_python(
-        "import pipeline.colmap, zlib, gzip, io, numpy as np, cv2\n"
+        "import pipeline.cameras.colmap, zlib, gzip, io, numpy as np, cv2\n"
         "data = np.random.default_rng(0).integers(0, 9, 1 << 20, dtype=np.uint8)\n"
         "assert zlib.decompress(zlib.compress(data.tobytes())) == data.tobytes()\n"
         "assert gzip.decompress(gzip.compress(data.tobytes())) == data.tobytes()\n"
@@ -35,16 +37,21 @@ def test_zlib_survives_pycolmap():
 
 
 def test_sigterm_still_ends_the_process():
-    done = run_python("import pipeline.colmap, os, signal; os.kill(os.getpid(), signal.SIGTERM); print('alive')")
+    done = run_python(
+        "import pipeline.cameras.colmap, os, signal; os.kill(os.getpid(), signal.SIGTERM); print('alive')"
+    )
     assert done.returncode == -15 and done.stdout == ""
 
 
 def test_nothing_else_imports_pycolmap():
     pattern = re.compile(r"^\s*(import|from)\s+pycolmap\b", re.MULTILINE)
     importers = [
-        p.name for room in ("pipeline", "dope") for p in (ROOT / room).rglob("*.py") if pattern.search(p.read_text())
+        p.relative_to(ROOT).as_posix()
+        for room in ("pipeline", "dope")
+        for p in (ROOT / room).rglob("*.py")
+        if pattern.search(p.read_text())
     ]
-    assert importers == ["colmap.py"]
+    assert importers == ["pipeline/cameras/colmap/base.py"]
 
 
 @pytest.mark.parametrize(
@@ -60,9 +67,9 @@ def test_nothing_else_imports_pycolmap():
 def test_intrinsics_project_as_colmap_does(model, parameters, expected_focals, expected_distortion):
     from pipeline.geometry import Camera
 
-    camera = colmap.pycolmap.Camera.create_from_model_name(1, model, 1.0, 640, 480)
+    camera = pycolmap.Camera.create_from_model_name(1, model, 1.0, 640, 480)
     camera.params = parameters
-    K, distortion = colmap._opencv_intrinsics(camera)
+    K, distortion = _opencv_intrinsics(camera)
     assert (K[0, 0], K[1, 1]) == expected_focals and tuple(distortion) == expected_distortion
     xyz = np.array([[0.3, -0.2, 1.0], [-0.5, 0.4, 2.0]])
     ours = Camera(640, 480, K, distortion, np.eye(3), np.zeros(3)).project(xyz)[0]
@@ -70,9 +77,9 @@ def test_intrinsics_project_as_colmap_does(model, parameters, expected_focals, e
 
 
 def test_a_fisheye_camera_is_refused():
-    camera = colmap.pycolmap.Camera.create_from_model_name(1, "OPENCV_FISHEYE", 500.0, 640, 480)
+    camera = pycolmap.Camera.create_from_model_name(1, "OPENCV_FISHEYE", 500.0, 640, 480)
     with pytest.raises(colmap.ColmapError, match="OPENCV_FISHEYE"):
-        colmap._opencv_intrinsics(camera)
+        _opencv_intrinsics(camera)
 
 
 def test_a_folder_without_a_model_and_a_damaged_model_are_named(tmp_path):

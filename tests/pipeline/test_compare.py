@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dope.common.errors import BadInput
-from pipeline.compare import compare_cameras, read_reference
+from pipeline.cameras.compare import compare_cameras, read_reference
 from pipeline.geometry import Camera, Similarity
 from pipeline.sequence import Frame
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from synthetic import OBJECT, Scene, orbit, write_sequence
 from test_farthest_points import naive
 
-from pipeline.correspondences import (
+from pipeline.correspond.match import (
     CorrespondConfig,
     CorrespondenceConfig,
     Surface,
@@ -20,9 +20,9 @@ from pipeline.correspondences import (
     match,
     match_views,
 )
-from pipeline.pairs import PairsConfig
+from pipeline.correspond.pairs import PairsConfig
+from pipeline.correspond.views import View, ViewsConfig, build_views, read_views, view_camera, view_to_source_pixels
 from pipeline.sequence import Sequence, read_image
-from pipeline.views import View, ViewsConfig, build_views, read_views, view_camera, view_to_source_pixels
 
 DISTORTION = (-0.18, 0.06, 0.002, -0.003)
 CONFIG = CorrespondConfig(ViewsConfig(every=1), PairsConfig(max_pairs=12))

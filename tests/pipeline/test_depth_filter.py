@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.depth_filter import confirmations, drop_islands, fuse, sample_pixels
+from pipeline.depth.depth_filter import confirmations, cross_check, drop_islands, fuse, sample_pixels
 from pipeline.geometry import Camera
 
 RNG = np.random.default_rng(0)
@@ -85,6 +85,30 @@ def test_occluded_and_unknown_depths_are_not_confirmed() -> None:
     assert not confirmations(camera, np.zeros_like(depth), [(other, plane_depth(other, 4.0))], 0.01).any()
     behind = Camera(80, 60, other.K, other.distortion, np.diag([-1.0, 1, -1]), np.zeros(3))  # looks the other way
     assert not confirmations(camera, depth, [(behind, np.full_like(depth, -4.0))], 0.01).any()
+
+
+def test_only_views_that_see_farther_all_around_a_place_speak_against_it() -> None:
+    camera, other = camera_beside(0, 0), camera_beside(0.5, 7)
+    depth, true, nearer = plane_depth(camera, 3.0), plane_depth(other, 4.0), plane_depth(other, 2.0)
+    seen = confirmations(camera, depth, [(other, plane_depth(other, 3.0))], 0.01) > 0
+    assert 0.5 < seen.mean() < 1
+    against = cross_check(camera, depth, [(other, true)], 0.01, see_through=0.03).against
+    assert not against[~seen].any()  # outside the other image
+    inner = np.zeros_like(seen)
+    inner[8:-8, 20:-20] = True
+    assert (against[inner] == 1).all()
+    assert not cross_check(camera, depth, [(other, true)], 0.01).against.any()
+    assert not cross_check(camera, depth, [(other, nearer)], 0.01, see_through=0.03).against.any()
+    assert not cross_check(camera, depth, [(other, true)], 0.01, see_through=0.4).against.any()
+    # a wire before the plane: beside it there is no certainty, wherever it is one pixel thick
+    wire = true.copy()
+    wire[:, ::3] = plane_depth(other, 3.0)[:, ::3]
+    assert not cross_check(camera, depth, [(other, wire)], 0.01, see_through=0.03).against.any()
+    holes = true.copy()
+    holes[::3] = 0
+    assert not cross_check(camera, depth, [(other, holes)], 0.01, see_through=0.03).against.any()
+    backwards = Camera(80, 60, other.K, other.distortion, np.diag([-1.0, 1, -1]), np.zeros(3))
+    assert not cross_check(camera, depth, [(backwards, np.full_like(depth, 9.0))], 0.01, see_through=0.03).against.any()
 
 
 def test_samples_are_those_of_the_pixel_that_holds_the_position() -> None:

@@ -43,6 +43,7 @@ def test_flags_win_over_the_environment() -> None:
         (2, 2, {}, "not in 0..1"),
         (0, None, {}, "go together"),
         (None, None, {"JOB_COMPLETION_INDEX": "0"}, "JOB_COMPLETIONS"),
+        (None, None, {"SLURM_ARRAY_TASK_ID": "1", "SLURM_ARRAY_TASK_MIN": "x"}, "not a number"),
         (None, None, {"AWS_BATCH_JOB_ARRAY_INDEX": "x", "AWS_BATCH_JOB_ARRAY_SIZE": "2"}, "not a number"),
     ],
 )

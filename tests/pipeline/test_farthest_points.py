@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.farthest_points import farthest_points
+from pipeline.correspond.farthest_points import farthest_points
 
 
 def naive(pixels: NDArray, n: int, start: int) -> list[int]:
@@ -24,12 +24,14 @@ def blob(kind: str) -> NDArray:
         "two parts": (np.hypot(x - 20, y - 20) < 12) | (np.hypot(x - 120, y - 100) < 9),
         "sparse": np.random.default_rng(3).random((120, 140)) < 0.01,
         "line": (y == 60) & (x > 5),
+        "far corners": (np.abs(np.subtract.outer(np.arange(300), np.arange(400))) < 2),
+        "column": np.ones((300, 1), dtype=bool),
     }
     rows, columns = np.nonzero(shapes[kind])
     return np.stack([columns + 37, rows + 1000], axis=1)  # where the pixels lie does not matter
 
 
-@pytest.mark.parametrize("kind", ["disc", "ring", "two parts", "sparse", "line"])
+@pytest.mark.parametrize("kind", ["disc", "ring", "two parts", "sparse", "line", "far corners", "column"])
 def test_same_indices_as_the_loop(kind: str) -> None:
     pixels = blob(kind)
     for start in (0, len(pixels) // 3, len(pixels) - 1):

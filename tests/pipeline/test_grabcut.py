@@ -8,12 +8,13 @@ import pytest
 from synthetic import Scene, orbit, write_sequence
 
 from dope.common.errors import BadInput
+from pipeline.cameras.sparse_points import Tracks
 from pipeline.geometry import Camera
-from pipeline.grabcut import grabcut_masks
-from pipeline.masks import MasksConfig
-from pipeline.object_region import ball_silhouette, pixels_of, points_on_object, support_plane, visual_hull
+from pipeline.masks.grabcut import grabcut_masks
+from pipeline.masks.imported import MasksConfig
+from pipeline.masks.object_region import ball_silhouette, pixels_of, points_on_object, support_plane
+from pipeline.masks.visual_hull import visual_hull
 from pipeline.sequence import Sequence
-from pipeline.sparse_points import Tracks
 
 cv2.setNumThreads(1)
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.holdout import held_out_arc, held_out_objects
+from pipeline.shards.holdout import held_out_arc, held_out_objects
 
 
 def test_held_out_objects_are_a_fair_share() -> None:

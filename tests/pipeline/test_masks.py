@@ -11,11 +11,11 @@ import pytest
 from tiny_media import encode, pan, with_orientation, write_photos, write_video
 
 from dope.common.errors import BadInput
-from pipeline.frames import FramesConfig, extract_frames
-from pipeline.mask_io import read_mask_values
-from pipeline.masks import MasksConfig, import_masks
+from pipeline.inputs.frames import FramesConfig, extract_frames
+from pipeline.inputs.sources import Source, find_sources
+from pipeline.masks.imported import MasksConfig, import_masks
+from pipeline.masks.mask_io import read_mask_values
 from pipeline.sequence import Sequence
-from pipeline.sources import Source, find_sources
 
 N, HEIGHT, WIDTH = 6, 128, 192
 

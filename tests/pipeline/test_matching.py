@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline import matching
-from pipeline.colmap import MatchedPair
+from pipeline.cameras import matching
+from pipeline.cameras.colmap import MatchedPair
 
 
 def test_neighbours_with_and_without_wrapping_around():

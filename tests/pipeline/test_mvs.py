@@ -12,11 +12,12 @@ import pytest
 from synthetic import Scene, orbit, pixel_centres, write_sequence
 
 from dope.common.errors import BadInput
-from pipeline import mvs, patchmatch
+from pipeline.cameras.sparse_points import Tracks
+from pipeline.depth import mvs, patchmatch
+from pipeline.depth.mvs import DepthConfig, object_centre, sgbm_depth, sparse_depth, write_depths
+from pipeline.depth.readers import read_colmap_array
 from pipeline.geometry import Camera
-from pipeline.mvs import DepthConfig, object_centre, sgbm_depth, sparse_depth, write_depths
 from pipeline.sequence import Sequence
-from pipeline.sparse_points import Tracks
 
 SCENE = Scene()
 CAMERAS = orbit(7, arc_deg=49, distance=4.5, distortion=(0.05, -0.07, 0.001, -0.001), wobble=0.05)
@@ -163,7 +164,7 @@ def test_the_centre_is_the_origin_only_of_a_normalised_sequence(sequence: Sequen
 
 
 def test_patchmatch_without_a_gpu_is_refused(sequence: Sequence, monkeypatch: pytest.MonkeyPatch) -> None:
-    from pipeline import colmap
+    from pipeline.cameras import colmap
 
     monkeypatch.setattr(colmap, "has_cuda_gpu", lambda: False)
     monkeypatch.setattr(colmap, "read_points", lambda _: tracks_of(CAMERAS))
@@ -188,7 +189,7 @@ def test_colmap_arrays_are_read_in_their_order(tmp_path: Path, shape: tuple[int,
     values = np.random.default_rng(0).uniform(size=shape).astype(np.float32)
     path = tmp_path / "000000.jpg.geometric.bin"
     path.write_bytes(colmap_array(values))
-    assert np.array_equal(patchmatch.read_array(path), values)
+    assert np.array_equal(read_colmap_array(path), values)
 
 
 @pytest.mark.parametrize("data", [b"", b"7&5&", b"7&5&1&" + bytes(11), b"7&5&1&" + bytes(7 * 5 * 4 + 4), b"a&b&c&dd"])
@@ -196,7 +197,7 @@ def test_damaged_colmap_arrays_are_refused_by_name(tmp_path: Path, data: bytes) 
     path = tmp_path / "000000.jpg.geometric.bin"
     path.write_bytes(data)
     with pytest.raises(BadInput, match=r"000000\.jpg\.geometric\.bin"):
-        patchmatch.read_array(path)
+        read_colmap_array(path)
 
 
 def test_undistorted_depth_returns_to_the_distorted_grid() -> None:
@@ -215,7 +216,7 @@ def test_undistorted_depth_returns_to_the_distorted_grid() -> None:
 
 def test_patchmatch_workspace_becomes_depth_maps(sequence: Sequence, monkeypatch: pytest.MonkeyPatch) -> None:
     """CUDA is played by a function that writes true depth where COLMAP would; frame 6 it leaves out."""
-    from pipeline import colmap
+    from pipeline.cameras import colmap
 
     pinholes = {i: Camera(280, 210, np.array([[300.0, 0, 140], [0, 300, 105], [0, 0, 1]]), np.zeros(4), c.R, c.t)
                 for i, c in enumerate(CAMERAS)}  # fmt: skip

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from synthetic import look_at
 
+from pipeline.depth.neighbours import NeighbourConfig, choose_neighbours, sees
 from pipeline.geometry import Camera
-from pipeline.neighbours import NeighbourConfig, choose_neighbours, sees
 
 ORIGIN = np.zeros(3)
 

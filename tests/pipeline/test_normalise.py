@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipeline.cameras.normalise import find_object, points_in_masks
 from pipeline.geometry import Camera
-from pipeline.normalise import find_object, points_in_masks
 
 K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
 CENTRE, RADIUS = np.array([4.0, -2.0, 7.0]), 0.5

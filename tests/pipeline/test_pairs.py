@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from synthetic import look_at, orbit
 
+from pipeline.correspond.pairs import PairsConfig, candidate_pairs, select_pairs, view_angles_deg
 from pipeline.geometry import Camera
-from pipeline.pairs import PairsConfig, candidate_pairs, select_pairs, view_angles_deg
 
 ORIGIN = np.zeros(3)
 RING = orbit(36, elevation_deg=0, wobble=0.0)
@@ -39,6 +39,20 @@ def test_the_same_view_twice_is_no_pair() -> None:
     twin = Camera(320, 240, RING[0].K, np.zeros(4), R, t)
     closer = Camera(320, 240, RING[0].K, np.zeros(4), *look_at(near * 0.5, ORIGIN))
     assert len(select_pairs([twin, twin, closer], ORIGIN, None, PairsConfig())) == 0
+
+
+def test_a_camera_that_returns_to_its_place_is_the_same_view_however_it_is_turned() -> None:
+    """Two laps, the second a little off, rolled about the viewing axis and aimed elsewhere: no pair across the laps."""
+    places = [camera.centre for camera in RING[:12]]
+    laps = []
+    for lap, (roll, nearer) in enumerate(((0.0, 1.0), (80.0, 0.9))):
+        for k, centre in enumerate(places):
+            off = 0.03 * lap * np.array([np.sin(k), np.cos(k), 1.0])
+            R, t = look_at(centre * nearer + off, 0.3 * lap * np.ones(3), roll_deg=roll)
+            laps.append(Camera(320, 240, RING[0].K, np.zeros(4), R, t))
+    pairs = select_pairs(laps, ORIGIN, None, PairsConfig(max_pairs=10_000))
+    assert len(pairs) > 200
+    assert not {(int(i), int(j)) for i, j in pairs} & {(k, k + 12) for k in range(12)}
 
 
 def test_angles_and_views_are_used_evenly() -> None:

@@ -9,11 +9,11 @@ import pytest
 from tiny_media import encode, pan, texture, with_orientation, write_photos
 
 from dope.common.errors import BadInput
-from pipeline.frame_quality import QualityConfig, difference, look_at, neighbours_are_alike
-from pipeline.frames import FramesConfig, extract_frames
-from pipeline.photos import list_photos, read_jpeg_header, read_photo, turn_upright
+from pipeline.inputs.frame_quality import QualityConfig, difference, look_at, neighbours_are_alike
+from pipeline.inputs.frames import FramesConfig, extract_frames
+from pipeline.inputs.photos import list_photos, read_jpeg_header, read_photo, turn_upright
+from pipeline.inputs.sources import Source, find_sources
 from pipeline.sequence import Sequence
-from pipeline.sources import Source, find_sources
 
 
 def extract(folder: Path, out: Path, **settings: object) -> tuple[dict, Sequence]:

@@ -13,16 +13,17 @@ from tiny_media import encode, pan, write_photos
 from typer.testing import CliRunner
 
 from dope.common.errors import BadInput
-from pipeline import commands, prepare
+from pipeline import commands, prepare, tasks
+from pipeline.cameras.sfm import SfmConfig
 from pipeline.children import ChildFailed, ChildStopped
-from pipeline.correspondences import CorrespondConfig
-from pipeline.mask_io import write_masks
-from pipeline.masks import MasksConfig
-from pipeline.prepare import ColmapConfig, RunOptions, add_masks, correspond_all
+from pipeline.correspond.match import CorrespondConfig
+from pipeline.inputs.sources import Source, find_sources
+from pipeline.masks.imported import MasksConfig
+from pipeline.masks.mask_io import write_masks
+from pipeline.prepare import ColmapConfig, add_masks, correspond_all
 from pipeline.sequence import Sequence
-from pipeline.sfm import SfmConfig
-from pipeline.sources import Source, find_sources
 from pipeline.stages import StageResult, read_marker
+from pipeline.tasks import RunOptions
 
 HERE, AGAIN = RunOptions(), RunOptions(overwrite=True)
 MORE = ColmapConfig(sfm=SfmConfig(max_features=3000))
@@ -49,7 +50,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         nothing = BadInput("nothing")
         return write_masks(sequence, frames, ((f, mask) for f in frames if f.image), min_share=0.01, nothing=nothing)
 
-    monkeypatch.setattr(prepare, "run_in_child", lambda work, *args, limits, notify: work(*args, notify))
+    monkeypatch.setattr(tasks, "run_in_child", lambda work, *args, limits, notify: work(*args, notify))
     for name in ("reconstruct", "compute_depth", "correspond"):
         monkeypatch.setattr(prepare, name, stand_in(name))
     monkeypatch.setattr(prepare, "_grabcut", grabcut)
@@ -84,7 +85,7 @@ def test_finished_work_is_skipped_without_a_process(
     photos: Path, tmp_path: Path, calls: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert states(colmap(photos, tmp_path / "w")) == ["frames ok", "sfm ok", "depth ok"]
-    monkeypatch.delattr(prepare, "run_in_child")
+    monkeypatch.delattr(tasks, "run_in_child")
     assert states(colmap(photos, tmp_path / "w")) == ["frames ok skipped", "sfm ok skipped", "depth ok skipped"]
     assert len(calls) == 2
 
@@ -132,7 +133,7 @@ def test_given_masks_are_kept_until_others_take_their_place(photos: Path, tmp_pa
     fox = Sequence(tmp_path / "w/fox")
     colmap(photos, tmp_path / "w", masks_for(photos, tmp_path / "given"))
     (row,) = add_masks([fox], MasksConfig(), {}, HERE)
-    assert row.ok and row.details["from"] == "given to `dope prep colmap`" and row.details["masks"] == 6
+    assert row.ok and row.details["from"] == "the input" and row.details["masks"] == 6
     (row,) = add_masks([fox], MasksConfig(), {"fox": masks_for(photos, tmp_path / "later", columns=99)}, HERE)
     assert row.ok and row.details["from"] == str(tmp_path / "later")
     (row,) = add_masks([fox], MasksConfig(), {}, HERE)
@@ -172,7 +173,7 @@ def break_off(monkeypatch: pytest.MonkeyPatch, error: Exception, stage: str | No
             notify(f"{stage}: started")
         raise error
 
-    monkeypatch.setattr(prepare, "run_in_child", child)
+    monkeypatch.setattr(tasks, "run_in_child", child)
 
 
 def test_what_was_stopped_goes_on(photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,11 +13,11 @@ import pytest
 
 from dope.common.errors import BadInput
 from dope.common.seeds import generator
-from pipeline import colmap, model_checks
-from pipeline.compare import compare_cameras, read_reference
+from pipeline.cameras import colmap, model_checks
+from pipeline.cameras.compare import compare_cameras, read_reference
+from pipeline.cameras.sfm import SfmConfig, reconstruct
 from pipeline.geometry import Camera, similarity_between
 from pipeline.sequence import Frame, Sequence, SequenceInfo, read_image, write_image
-from pipeline.sfm import SfmConfig, reconstruct
 
 CAPTURES = Path(__file__).parents[2].parent / "shared/data/captures"
 SIZE = 320

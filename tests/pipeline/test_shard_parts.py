@@ -3,18 +3,19 @@
 import multiprocessing
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 from synthetic import orbit, write_sequence
 
 from dope.common.errors import DiskFull
-from pipeline import shard_parts
-from pipeline.correspondences import CorrespondConfig, correspond
+from pipeline.correspond.match import CorrespondConfig, correspond
+from pipeline.correspond.views import ViewsConfig
 from pipeline.engines import Share
 from pipeline.sequence import Sequence
-from pipeline.shards import ShardsConfig, verify_shards, write_shards
+from pipeline.shards import dataset
+from pipeline.shards.dataset import ShardsConfig, verify_shards, write_shards
 from pipeline.stages import run_stage
-from pipeline.views import ViewsConfig
 
 CONFIG = ShardsConfig(samples_per_shard=7, holdout="none")
 
@@ -75,15 +76,15 @@ def test_a_part_that_broke_off_goes_on_and_the_old_dataset_stays(
 ) -> None:
     out = tmp_path / "out"
     write_shards(sequences[:1], out, CONFIG)
-    before, real, written = bytes_of(out), shard_parts.write_tar, []
+    before, real, written = bytes_of(out), dataset.write_tar, []
 
-    def write_tar(path: Path, samples: list, name: str) -> shard_parts.WrittenShard:
+    def write_tar(path: Path, kind: Any, samples: Any, name: str) -> dataset.WrittenShard:
         written.append(name)
         if len(written) == 3:
             raise OSError(28, "No space left on device")
-        return real(path, samples, name)
+        return real(path, kind, samples, name)
 
-    monkeypatch.setattr(shard_parts, "write_tar", write_tar)
+    monkeypatch.setattr(dataset, "write_tar", write_tar)
     with pytest.raises(DiskFull):
         write_shards(sequences, out, CONFIG, share=Share(0, 2))
     assert bytes_of(out) == before

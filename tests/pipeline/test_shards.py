@@ -20,14 +20,14 @@ from synthetic import Scene, orbit, write_sequence
 
 from dope.common import files
 from dope.common.errors import BadInput, DiskFull, UsageError
-from pipeline import shard_writer, shards
-from pipeline.correspondences import CorrespondConfig, correspond
+from pipeline.correspond.match import CorrespondConfig, correspond
+from pipeline.correspond.pairs import PairsConfig
+from pipeline.correspond.views import ViewsConfig, read_views
 from pipeline.geometry import Camera, epipolar_distance_px, fundamental
-from pipeline.pairs import PairsConfig
 from pipeline.sequence import Sequence
-from pipeline.shards import ShardsConfig, verify_shards, write_shards
-from pipeline.stages import run_stage
-from pipeline.views import ViewsConfig, read_views
+from pipeline.shards import writer as shard_writer
+from pipeline.shards.dataset import ShardsConfig, verify_shards, write_shards
+from pipeline.stages import StageResult, run_stage, write_marker
 
 CORRESPOND = CorrespondConfig(ViewsConfig(every=1), PairsConfig(max_pairs=40))
 CONFIG = ShardsConfig(samples_per_shard=25)
@@ -257,20 +257,23 @@ def test_sequences_that_are_not_ready_are_listed(work: Path, sequences: list[Seq
     bare = write_sequence(tmp_path / "bare", orbit(1, width=80, height=60, focal=90), masks=False)
     run_stage(bare, "correspond", CORRESPOND, "", lambda: correspond(bare, CORRESPOND))
     never = write_sequence(tmp_path / "never", orbit(1, width=80, height=60, focal=90))
+    lost = write_sequence(tmp_path / "lost", orbit(1, width=80, height=60, focal=90))
+    write_marker(lost, StageResult("lost", "sfm", "failed", reason="nothing registers"))
     broken = Sequence(Path(shutil.copytree(work / "bell", tmp_path / "broken")))
     (broken.views / "000007.jpg").unlink()
     torn = Sequence(Path(shutil.copytree(work / "bell", tmp_path / "torn")))
     torn.correspondences.write_bytes(torn.correspondences.read_bytes()[:999])
-    details = write_shards([*sequences[:2], flat, bare, never, broken, torn], tmp_path / "out", CONFIG)
+    details = write_shards([*sequences[:2], flat, bare, never, lost, broken, torn], tmp_path / "out", CONFIG)
     assert details["sequences"] == 2
     reasons = details["left_out"]
     assert "empty: only 0 of 3 views" in reasons["flat"] and "dope prep masks" in reasons["bare"]
+    assert reasons["lost"] == "stage 'sfm' failed: nothing registers"
     assert reasons["never"] == "stage 'correspond' has not been run"
     assert "000007.jpg" in reasons["broken"] and "correspondences.parquet" in reasons["torn"]
     assert json.loads((tmp_path / "out/dataset.json").read_text())["counts"]["left_out"] == reasons
     with pytest.raises(BadInput, match=r"never: .*not been run.*dope prep correspond"):
         write_shards([never], tmp_path / "none", CONFIG)
-    with pytest.raises(BadInput, match="none was given"):
+    with pytest.raises(BadInput, match="WORK holds none"):
         write_shards([], tmp_path / "none", CONFIG)
     assert not (tmp_path / "none").exists()
 
@@ -375,12 +378,6 @@ def test_counts_that_disagree_are_named(dataset: tuple[Path, dict[str, Any]], tm
     files.write_json(out / "dataset.json", manifest)
     with pytest.raises(BadInput, match=r"train-000000\.tar.*samples"):
         verify_shards(out)
-
-
-def test_rounds_with_objects_of_unequal_length() -> None:
-    samples: Any = [["a1", "a2", "a3"], [], ["b1"], ["c1", "c2"]]
-    order = list(shards.rounds(samples, 0, "train"))
-    assert [sorted(order[:3]), sorted(order[3:5]), order[5:]] == [["a1", "b1", "c1"], ["a2", "c2"], ["a3"]]
 
 
 def test_images_of_the_two_views_show_the_same_texture(dataset: tuple[Path, dict[str, Any]]) -> None:

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from tiny_media import encode, pan, texture, write_photos
 
+from pipeline.inputs.sources import find_sources, input_errors_as_rows, known_sources, source_fingerprint
 from pipeline.sequence import Sequence, SequenceInfo
-from pipeline.sources import find_sources, input_errors_as_rows, known_sources, source_fingerprint
 
 PHOTO = encode(texture(16, 16))
 
@@ -99,7 +99,7 @@ def test_a_folder_that_may_not_be_read_is_a_row(tmp_path: Path, monkeypatch: pyt
     def forbidden(folder: Path) -> list[Path]:
         raise PermissionError(13, "Permission denied", str(folder))
 
-    monkeypatch.setattr("pipeline.sources.list_photos", forbidden)
+    monkeypatch.setattr("pipeline.inputs.sources.list_photos", forbidden)
     sources, ((name, path, error),) = find_sources([tmp_path / "in", good])
     assert [s.id for s in sources] == ["good"] and (name, path) == ("in", tmp_path / "in")
     assert str(closed) in str(error) and "Permission denied" in str(error)
@@ -121,7 +121,7 @@ def test_masks_are_found_for_one_and_for_many(tmp_path: Path) -> None:
     for template in (str(tmp_path / "all"), "{}/masks"):
         sources, errors = find_sources([tmp_path / "fox", tmp_path / "cat"], masks=template)
         assert [s.id for s in sources] == ["fox"] and sources[0].masks is not None
-        assert [(name, "no such folder of masks" in str(e)) for name, _, e in errors] == [("cat", True)]
+        assert [(name, "no such file or folder of masks" in str(e)) for name, _, e in errors] == [("cat", True)]
     touch(tmp_path / "clip.mp4")
     photo_folder(tmp_path / "clip_masks")
     assert find_sources([tmp_path / "clip.mp4"], masks="{}_masks")[0][0].masks == tmp_path / "clip_masks"
@@ -163,3 +163,11 @@ def test_a_sequence_keeps_its_name_when_inputs_of_the_same_name_join_it(tmp_path
     assert [source.id for source in find_sources([second], known=known)[0]] == ["b_mug"]
     first.unlink()  # moved away: under its name it is still the same sequence
     assert [source.id for source in find_sources([second], known=known_sources(work))[0]] == ["mug"]
+
+
+def test_a_co3d_download_is_not_taken_for_photo_folders(tmp_path: Path) -> None:
+    photo_folder(tmp_path / "apple/1_2_3/images")
+    touch(tmp_path / "apple/frame_annotations.jgz")
+    for place in (tmp_path, tmp_path / "apple"):
+        sources, errors = find_sources([place])
+        assert not sources and "dope prep co3d" in str(errors[0][2])

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from synthetic import Scene, look_at, pixel_centres
 
-from pipeline.geometry import Camera
-from pipeline.stereo import (
+from pipeline.depth.stereo import (
     MAX_DISPARITIES,
     View,
     match,
@@ -19,6 +18,7 @@ from pipeline.stereo import (
     sample_within_surfaces,
     stereo_depth,
 )
+from pipeline.geometry import Camera
 
 DISTORTION = (0.06, -0.09, 0.002, -0.001)
 SIZE = (200, 160)

@@ -8,10 +8,10 @@ import pytest
 from tiny_media import index_first, pan, texture, with_rotation, write_video
 
 from dope.common.errors import BadInput
-from pipeline.frames import FramesConfig, extract_frames
+from pipeline.inputs.frames import FramesConfig, extract_frames
+from pipeline.inputs.sources import Source
+from pipeline.inputs.videos import Windows
 from pipeline.sequence import Sequence
-from pipeline.sources import Source
-from pipeline.videos import Windows
 
 
 def extract(path: Path, out: Path, **settings: object) -> tuple[dict, Sequence]:

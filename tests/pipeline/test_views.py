@@ -9,10 +9,8 @@ import pytest
 from synthetic import OBJECT, Scene, orbit, pixel_centres, write_sequence
 
 from dope.common.errors import BadInput
-from pipeline.depth_sampling import DepthSampler
-from pipeline.geometry import Camera
-from pipeline.sequence import Frame, Sequence, write_image
-from pipeline.views import (
+from pipeline.correspond.depth_sampling import DepthSampler
+from pipeline.correspond.views import (
     View,
     ViewsConfig,
     build_views,
@@ -23,6 +21,8 @@ from pipeline.views import (
     view_to_source_pixels,
     write_view,
 )
+from pipeline.geometry import Camera
+from pipeline.sequence import Frame, Sequence, write_image
 
 DISTORTION = (-0.18, 0.06, 0.002, -0.003)
 SCENE = Scene("box")

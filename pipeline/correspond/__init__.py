@@ -1,0 +1,1 @@
+"""Stage `correspond`: square views, pairs of them, and the pixels that correspond."""

@@ -1,0 +1,1 @@
+"""Stage `depth`: a z-depth map for every registered frame."""

@@ -1,0 +1,1 @@
+"""Stage `frames`: inputs found, frames chosen, judged and written."""

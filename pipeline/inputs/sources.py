@@ -1,0 +1,324 @@
+"""Which sequences a command line means: video files, folders of photos, and folders of either, an id for each.
+
+car.mp4                     one sequence
+fox/0001.jpg ...            one sequence (a folder of photos)
+fox/images/ + fox/masks/    one sequence named `fox`: a folder that holds `images` with photos is one capture
+videos/*.mov                one sequence a video
+<category>/<instance>.mp4   any depth of folders above videos and captures
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from dope.common import files
+from dope.common.errors import BadInput, UsageError, legible
+from pipeline.inputs.photos import PHOTO_SUFFIXES, UNSUPPORTED_PHOTOS, list_photos, natural_order
+from pipeline.sequence import find_sequences, sequence_id
+from pipeline.stages import StageResult
+
+VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"})
+NOT_PHOTOS = frozenset({"mask", "masks", "depth", "depths", "segmentation", "segmentations"})
+"""Folder names that lie beside photos and videos and are never taken for a capture unless they are named."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """One raw input: a video file, or a folder of photos.
+
+    Attributes:
+        path: the video, or the folder that holds the photos themselves.
+        id: name of the sequence, unique among the sources of one command.
+        kind: "video" or "photos".
+        category: the class label, or None; carried for evaluation only.
+        instance: name of the object.
+        masks: folder of masks made by other tools, or a file of results of a segmentation tool, or None.
+        masks_shared: that file is there for other sources, too.
+        cameras: cameras found by other tools (`pipeline.cameras.known`), or None.
+        depths: folder of depth maps made by other tools (`pipeline.depth.imported`), or None.
+    """
+
+    path: Path
+    id: str
+    kind: Literal["video", "photos"]
+    category: str | None = None
+    instance: str | None = None
+    masks: Path | None = None
+    cameras: Path | None = None
+    depths: Path | None = None
+    masks_shared: bool = False
+
+    @property
+    def home(self) -> Path:
+        """What the sequence is named after: the video, or the capture's folder (not its `images`)."""
+        inner = self.kind == "photos" and self.path.name == "images"
+        return self.path.parent if inner and self.path.absolute().parent.name else self.path
+
+
+SourceError = tuple[str, Path, BadInput]
+
+
+def find_sources(
+    inputs: Iterable[Path],
+    *,
+    category: str | None = None,
+    category_from: str = "none",
+    masks: str | None = None,
+    cameras: str | None = None,
+    depths: str | None = None,
+    known: Mapping[Path, str] | None = None,
+) -> tuple[list[Source], list[SourceError]]:
+    """The sequences that the paths on a command line stand for, and a row for each path that stands for none.
+
+    Args:
+        inputs: videos, folders of photos, or folders of those; order is kept, folders are read in natural order.
+        category: label of all sources.
+        category_from: "parent" takes the name of the folder above the video or capture where `category` is None.
+        masks: folder of masks, or a file of results (for several, `masks`/<id>.json or one for all of them). For one
+            source it is the folder itself, for several `masks`/<id>; a "{}" in it
+            stands for the capture's folder or the video's path without its suffix (`{}/masks`, `{}_masks`).
+        cameras: the same for cameras to reuse: a file, or a COLMAP model's folder.
+        depths: the same for folders of depth maps.
+        known: ids of the sources that WORK holds already (`known_sources`): they keep them, whatever else is given.
+
+    Returns:
+        Sources with unique ids (the parent's name is prefixed where two are the same), and (id, path, error) rows.
+    """
+    if category_from not in ("none", "parent"):
+        raise UsageError(f"'{category_from}' is not one of none, parent", where="--category-from")
+    found: list[Source] = []
+    errors: list[SourceError] = []
+    seen: set[Path] = set()
+    for path in inputs:
+        try:
+            sources = list(_expand(path, set(), top=True))
+        except BadInput as error:
+            errors.append((_name(path), path, error))
+            continue
+        except OSError as error:  # a folder below that may not be read
+            unreadable = BadInput(f"cannot be read ({error.strerror})", where=error.filename or path)
+            errors.append((_name(path), path, unreadable))
+            continue
+        for source in sources:
+            place = source.path.resolve()
+            if place in seen:  # the same video given twice is one sequence
+                continue
+            seen.add(place)
+            if legible(source.path.absolute()) == str(source.path.absolute()):
+                found.append(source)
+            else:
+                unwritable = BadInput("its name is not UTF-8", where=source.path, remedy="Rename it")
+                errors.append((source.id, source.path, unwritable))
+    found = [_labelled(source, category, category_from) for source in _with_unique_ids(found, known or {})]
+    patterns = {"masks": masks, "cameras": cameras, "depths": depths}
+    kept: list[Source] = []
+    for source in found:
+        try:
+            several = len(found) > 1
+            beside: dict[str, Any] = {name: _beside(source, name, p, several) for name, p in patterns.items() if p}
+        except BadInput as error:
+            errors.append((source.id, source.path, error))
+        else:
+            shared = several and masks is not None and beside["masks"] == Path(masks) and beside["masks"].is_file()
+            kept.append(replace(source, **beside, masks_shared=shared))
+    return kept, errors
+
+
+def known_sources(work: Path) -> dict[Path, str]:
+    """The sources of the sequences that WORK holds, where they still are, with their ids.
+
+    A source that has moved is not listed: under its old name it is still the same sequence.
+    """
+    known: dict[Path, str] = {}
+    for sequence in find_sequences(work) if work.is_dir() else ():
+        try:
+            source = Path(sequence.read_info().source)
+        except (BadInput, TypeError):
+            continue  # a damaged sequence.json is written anew
+        if source.exists():
+            known[source.resolve()] = sequence.id
+    return known
+
+
+def input_errors_as_rows(errors: Iterable[SourceError]) -> list[StageResult]:
+    """Inputs that cannot be used, as failed rows of the first stage."""
+    return [StageResult(name, "frames", "failed", reason=str(error)) for name, _path, error in errors]
+
+
+def source_fingerprint(source: Source) -> dict[str, Any]:
+    """Identifies the content of a source (masks too) by names, sizes and samples of the bytes; JSON values.
+
+    It does not depend on where the source lies. Raises `BadInput` where a file has gone.
+    """
+    value: dict[str, Any] = {"kind": source.kind, "id": source.id, "category": source.category}
+    try:
+        if source.kind == "video":
+            value["files"] = files.quick_fingerprint(source.path)
+        else:
+            value["files"] = folder_fingerprint(source.path)
+        if source.masks is not None:
+            value["masks"] = masks_fingerprint(source.masks)
+        for name, place in (("cameras", source.cameras), ("depths", source.depths)):
+            if place is not None:
+                value[name] = place_fingerprint(place, whole=name == "cameras")
+    except OSError as error:
+        raise BadInput(f"cannot be read ({error.strerror})", where=error.filename or source.path) from error
+    return value
+
+
+def folder_fingerprint(folder: Path) -> str:
+    """Identifies the pictures of a folder by number, names, sizes and samples of the bytes."""
+    digest = hashlib.sha256()
+    paths = list_photos(folder)
+    for path in paths:  # 3 x 64 KiB a photo: a folder of a thousand costs well under a second
+        digest.update(files.quick_fingerprint(path, chunk=1 << 16).encode())
+    return f"{len(paths)}:{digest.hexdigest()}"
+
+
+def masks_fingerprint(masks: Path) -> str:
+    """Identifies a folder of masks, or a file of results."""
+    return place_fingerprint(masks) if masks.is_file() else folder_fingerprint(masks)
+
+
+def place_fingerprint(place: Path, *, whole: bool = False) -> str:
+    """Identifies a file, or all files of a folder (not of those below), by names, sizes and samples of the bytes.
+
+    A file given by itself, or with `whole` each file, is read in full up to 48 MiB: one digit of a camera may change.
+    """
+    chunk = 1 << 24 if whole or place.is_file() else 1 << 16
+    paths = [place] if place.is_file() else sorted(path for path in place.iterdir() if path.is_file())
+    digest = hashlib.sha256()
+    for path in paths:
+        digest.update(files.quick_fingerprint(path, chunk=chunk).encode())
+    return f"{len(paths)}:{digest.hexdigest()}"
+
+
+def _expand(path: Path, above: set[Path], *, top: bool) -> Iterator[Source]:
+    """The sources at or below `path`. Raises `BadInput` where the path given by the user (`top`) holds none."""
+    if not path.exists():
+        raise BadInput("no such file or folder", where=path, remedy="Check how it is spelt")
+    if path.is_file():
+        if path.suffix.lower() not in VIDEO_SUFFIXES:
+            known = ", ".join(sorted(suffix[1:] for suffix in VIDEO_SUFFIXES))
+            remedy = f"Give videos ({known}) or folders of photos"
+            raise BadInput("is neither a video nor a folder of photos", where=path, remedy=remedy)
+        yield _source(path, "video")
+        return
+    if (path / "sequence.json").is_file():  # WORK lies among the inputs: what was made of them is none of them
+        if top:
+            raise BadInput("is a prepared sequence", where=path, remedy="Give the video or photos that it was made of")
+        return
+    if (path / "frame_annotations.jgz").is_file():  # its photos are those of one sequence each, and have their cameras
+        remedy = "Give the folder that holds it to `dope prep co3d`"
+        raise BadInput("is a category of a CO3D download", where=path, remedy=remedy)
+    entries = sorted((p for p in path.iterdir() if not p.name.startswith(".")), key=natural_order)
+    images = path / "images"
+    if images.is_dir() and list_photos(images):
+        yield _source(images, "photos")
+        return
+    videos = [entry for entry in entries if entry.suffix.lower() in VIDEO_SUFFIXES and entry.is_file()]
+    for video in videos:
+        yield _source(video, "video")
+    has_photos = bool(list_photos(path))
+    if has_photos:
+        yield _source(path, "photos")
+    below = False
+    place = path.resolve()
+    if not has_photos and place not in above:  # a link to a folder above would never end
+        for entry in entries:
+            if entry.is_dir() and entry.name.lower() not in NOT_PHOTOS:
+                for source in _expand(entry, above | {place}, top=False):
+                    below = True
+                    yield source
+    if top and not (videos or has_photos or below):
+        what = "holds neither photos nor videos" if entries else "is an empty folder"
+        raise BadInput(what, where=path, remedy=_remedy(entries))
+
+
+def _source(path: Path, kind: Literal["video", "photos"]) -> Source:
+    source = Source(path, "", kind)
+    return replace(source, id=_name(source.home))
+
+
+def _remedy(entries: list[Path]) -> str:
+    foreign = sorted({e.suffix.lower() for e in entries} & UNSUPPORTED_PHOTOS)
+    if foreign:
+        return f"Convert {', '.join(foreign)} files to JPEG first"
+    known = ", ".join(sorted(suffix[1:] for suffix in PHOTO_SUFFIXES))
+    return f"Photos are {known} files"
+
+
+def _name(path: Path) -> str:
+    path = path.absolute()  # "." and ".." have no name of their own
+    path = path if path.name not in ("", "..") else path.resolve()
+    return sequence_id(path.name if path.is_dir() else path.stem)
+
+
+def _with_unique_ids(sources: list[Source], known: Mapping[Path, str]) -> list[Source]:
+    """Prefix parents' names until no two ids are equal on any file system, then the file type, then a number.
+
+    Known sources keep their ids, and nobody else gets one of those.
+    """
+    there = [source for source in sources if source.path.resolve() in known]
+    new = [source for source in sources if source.path.resolve() not in known]
+    named = iter(_unique([*new], {name.casefold() for name in known.values()}))
+    kept = iter(replace(source, id=known[source.path.resolve()]) for source in there)
+    return [next(kept) if source.path.resolve() in known else next(named) for source in sources]
+
+
+def _unique(sources: list[Source], reserved: set[str]) -> list[Source]:
+    for level in range(1, 5):
+        groups: dict[str, list[int]] = defaultdict(list)
+        for index, source in enumerate(sources):
+            groups[source.id.casefold()].append(index)
+        taken_names = [name for name, group in groups.items() if len(group) > 1 or name in reserved]
+        clashes = [index for name in taken_names for index in groups[name]]
+        if not clashes:
+            return sources
+        for index in clashes:
+            source = sources[index]
+            parents = [p.name for p in source.home.absolute().parents if p.name]
+            if level <= 3:
+                prefix = "_".join(reversed(parents[:level]))
+                name = f"{prefix}_{_name(source.home)}"
+            else:
+                name = f"{source.id}_{source.path.suffix[1:] or 'photos'}"
+            sources[index] = replace(source, id=sequence_id(name))
+    taken = set(reserved)
+    for index, source in enumerate(sources):
+        name, number = source.id, 2
+        while name.casefold() in taken:
+            name, number = f"{source.id}_{number}", number + 1
+        taken.add(name.casefold())
+        sources[index] = replace(source, id=name)
+    return sources
+
+
+def _labelled(source: Source, category: str | None, category_from: str) -> Source:
+    if category is None and category_from == "parent":
+        category = source.home.absolute().parent.name or None
+    return replace(source, category=category, instance=source.id)
+
+
+def _beside(source: Source, what: str, given: str, several: bool) -> Path:
+    """Where the masks, cameras or depths of a source lie. Raises `BadInput` where there is nothing."""
+    if "{}" in given:
+        home = source.home.with_suffix("") if source.kind == "video" else source.home
+        place = Path(given.replace("{}", str(home)))
+    else:
+        place = Path(given) / source.id if several else Path(given)
+    if what == "masks" and several and "{}" not in given:  # results of a segmentation tool: one file for all, or each
+        results = (Path(given), place.with_name(f"{place.name}.json"))
+        place = next((path for path in results if path.is_file() and not place.is_dir()), place)
+    may_be_file = what in ("cameras", "masks")
+    if place.is_dir() or (may_be_file and place.is_file()):
+        return place
+    flag = "--reuse-cameras" if what == "cameras" else f"--{what}"
+    kind = "file or folder" if may_be_file else "folder"
+    remedy = f"{flag} is a {kind}: for several inputs it holds a {kind} for each id; {{}} stands for the input"
+    raise BadInput(f"no such {kind} of {what}", where=place, remedy=remedy)

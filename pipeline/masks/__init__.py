@@ -1,0 +1,1 @@
+"""Stage `masks`: the object in every frame, imported or cut out."""

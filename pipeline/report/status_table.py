@@ -1,0 +1,157 @@
+"""The status of many WORK folders as one Arrow table; Parquet files of other machines' status are merged in."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from itertools import islice
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from dope.common import files
+from dope.common.errors import BadInput
+from pipeline.engines import default_workers
+from pipeline.report.status_row import SCHEMA, sequence_row
+
+BATCH = 2000
+"""Sequences that become columns at a time: a row as a dict takes thirty times the memory of its place in a column."""
+SPREAD_FROM = 4 * BATCH
+"""From this many folders on, several processes read: parsing JSON keeps Python's lock."""
+
+FORMULA = r"\A([=+\-@\t\r])"
+"""How a text begins that spreadsheets run: names of folders come from strangers' disks."""
+
+Progress = Callable[[str, int, int], None]
+Item = tuple[str, bool]
+
+
+def read_status(places: list[Path], progress: Progress | None = None) -> pa.Table:
+    """One row (see `status_row.COLUMNS`) for each sequence of the given WORK folders and status Parquet files.
+
+    Rows are in the order of `places`, by id within each. Ids that occur more than once are marked `duplicate`.
+
+    Raises:
+        BadInput: no such folder, or a file that is not a status table.
+    """
+    report = progress or (lambda what, done, of: None)
+    tables = [read_work(place, report) if place.is_dir() else read_parquet(place) for place in places]
+    return _mark_duplicates(pa.concat_tables([SCHEMA.empty_table(), *tables]))
+
+
+def read_work(work: Path, progress: Progress) -> pa.Table:
+    """The rows of one WORK folder, by id."""
+    held = held_inodes()
+    try:
+        with os.scandir(work) as entries:
+            names = sorted(entry.name for entry in entries if not entry.name.startswith(".") and entry.is_dir())
+    except OSError as error:
+        raise BadInput(f"cannot be read ({error.strerror})", where=work) from error
+    items = [(name, bool(held) and _is_held(f"{work}/{name}/.lock", held)) for name in names]
+    read = partial(_read_batch, str(work))
+    batches = list(_chunks(items, BATCH))
+    tables, done = [], 0
+    for batch, table in zip(batches, _spread(read, batches, len(items)), strict=True):
+        tables.append(table)
+        done += len(batch)
+        progress("sequences", done, len(items))
+    return pa.concat_tables([SCHEMA.empty_table(), *tables])
+
+
+def read_parquet(path: Path) -> pa.Table:
+    """The rows of a file that `dope prep status --parquet` wrote, perhaps by an older version: absent columns are null.
+
+    Raises:
+        BadInput: no such file, not Parquet, or no table of this kind.
+    """
+    try:
+        table = pq.read_table(path)
+    except FileNotFoundError:
+        raise BadInput(
+            "no such folder or file", where=path, remedy="Name WORK folders or status Parquet files"
+        ) from None
+    except (OSError, pa.ArrowException) as error:
+        remedy = "Write it with `dope prep status WORK --parquet FILE`"
+        raise BadInput(f"is not a Parquet file that can be read ({error})", where=path, remedy=remedy) from error
+    if not {"id", "status"} <= set(table.column_names):
+        remedy = "Write it with `dope prep status WORK --parquet FILE`"
+        raise BadInput("is not a status table: it has no columns id and status", where=path, remedy=remedy)
+    try:
+        columns = [
+            table[field.name].cast(field.type) if field.name in table.column_names else pa.nulls(len(table), field.type)
+            for field in SCHEMA
+        ]
+        return pa.table(columns, schema=SCHEMA)
+    except (pa.ArrowException, KeyError) as error:
+        raise BadInput(f"is not a status table ({error})", where=path) from error
+
+
+def write_parquet(table: pa.Table, path: Path) -> None:
+    with files.atomic_path(path) as partial_path:
+        pq.write_table(table, partial_path)
+
+
+def write_csv(table: pa.Table, path: Path) -> None:
+    """The rows as CSV. A text that a spreadsheet would run as a formula gets a ' before it (OWASP, CSV injection)."""
+    from pyarrow import csv
+
+    for place, field in enumerate(table.schema):
+        if pa.types.is_string(field.type):
+            inert = pc.replace_substring_regex(table[field.name], FORMULA, r"'\1")
+            table = table.set_column(place, field, inert)
+    with files.atomic_path(path) as partial_path:
+        csv.write_csv(table, partial_path)
+
+
+def held_inodes(listing: str = "/proc/locks") -> frozenset[int]:
+    """Inodes of all files that a process of this machine holds by flock.
+
+    Asking each lock file itself would mean taking it for a moment, in which a run that starts would give up. Where the
+    system has no such list (macOS), or the process runs on another machine, a running sequence looks as it stands.
+    """
+    try:
+        lines = Path(listing).read_text(encoding="ascii").splitlines()
+        return frozenset(int(line.split()[5].rpartition(":")[2]) for line in lines if " FLOCK " in line)
+    except (OSError, ValueError, IndexError):
+        return frozenset()
+
+
+def _is_held(path: str, held: frozenset[int]) -> bool:
+    try:
+        return os.stat(path).st_ino in held  # noqa: PTH116 - 100,000 Paths are slow
+    except OSError:
+        return False
+
+
+def _read_batch(work: str, items: list[Item]) -> pa.Table:
+    rows = [row for name, running in items if (row := sequence_row(work, name, running=running)) is not None]
+    return pa.Table.from_pydict({name: [row[name] for row in rows] for name in SCHEMA.names}, schema=SCHEMA)
+
+
+def _spread(read: Callable[[list[Item]], pa.Table], batches: list[list[Item]], total: int) -> Iterator[pa.Table]:
+    workers = min(default_workers(), 8)
+    if total < SPREAD_FROM or workers < 2:
+        yield from map(read, batches)
+        return
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        yield from pool.map(read, batches)
+
+
+def _chunks(items: list[Any], size: int) -> Iterator[list[Any]]:
+    iterator = iter(items)
+    while chunk := list(islice(iterator, size)):
+        yield chunk
+
+
+def _mark_duplicates(table: pa.Table) -> pa.Table:
+    counts = table.group_by("id").aggregate([("status", "count")])
+    often = counts.filter(pc.greater(counts["status_count"], 1))["id"]
+    place = table.schema.get_field_index("duplicate")
+    marked = pc.is_in(table["id"], value_set=often.combine_chunks() if len(often) else pa.array([], pa.string()))
+    return table.set_column(place, "duplicate", marked)

@@ -1,0 +1,1 @@
+"""Prepared sequences packed into WebDataset tars and an index."""
