@@ -23,14 +23,15 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from dope.common import files
-from pipeline.compare import compare_cameras, read_reference
-from pipeline.geometry import epipolar_distance_px, fundamental
+from pipeline.cameras.compare import compare_cameras, read_reference
+from pipeline.correspond.views import read_views, view_to_source_pixels
+from pipeline.geometry import Camera, epipolar_distance_px, fundamental, rotation_angle_deg
 from pipeline.sequence import Sequence
 from pipeline.stages import read_marker
-from pipeline.views import read_views, view_to_source_pixels
 
 PLAIN = ("fox", "mold_gold_cape", "skull", "plush_doll")
 TURNTABLE = "ethiopian_head"
+WIDE = "co3d_apple"
 
 
 def say(figure: str, value: Any, **more: Any) -> None:
@@ -70,6 +71,33 @@ def cameras(captures: Path, work: Path) -> None:
             neighbour_rotation_max_deg=round(errors.relative_rotation_max_deg, 4),
             translation_median_percent=round(errors.translation_median_percent, 3),
         )
+
+
+def wide_baseline(captures: Path, out: Path) -> None:
+    """Twenty frames of a CO3D video, far apart, through the ordinary command; cameras against CO3D's."""
+    work = out / "wide"
+    dope("prep", "colmap", captures / WIDE, "--out", work, "--depth", "sparse")
+    names = sorted(path.stem for path in (captures / WIDE / "images").iterdir() if not path.name.startswith("."))
+    given = np.load(captures / WIDE / "gt_cameras.npz")
+    flip = np.diag([-1.0, -1.0, 1.0])  # PyTorch3D: x left, y up, row vectors
+    reference = {
+        name: Camera(1, 1, np.eye(3), np.zeros(4), flip @ R.T, flip @ T)
+        for name, R, T in zip(names, given["gtR"].astype(float), given["gtT"].astype(float), strict=True)
+    }
+    frames = Sequence(work / WIDE).read_frames()
+    errors = compare_cameras(frames, reference)
+    found = np.array([f.camera.R for f in frames if f.registered])
+    wanted = np.array([reference[Path(f.source_name).stem].R for f in frames if f.registered])
+    u, _, v = np.linalg.svd((wanted.transpose(0, 2, 1) @ found).sum(axis=0))  # the rotation that fits the worlds best
+    apart = rotation_angle_deg(found @ (wanted @ u @ v).transpose(0, 2, 1))
+    say(
+        "cameras",
+        {"registered": errors.n_registered, "frames": len(names)},
+        capture=WIDE,
+        neighbour_rotation_median_deg=round(errors.relative_rotation_median_deg, 4),
+        rotation_median_deg=round(float(np.median(apart)), 4),
+        translation_median_percent=round(errors.translation_median_percent, 3),
+    )
 
 
 def cost(work: Path) -> None:
@@ -142,6 +170,7 @@ def main() -> None:
     say("photos_to_shards_seconds", round(time.perf_counter() - start, 1), workers=2, captures=5)
     work = given.out / "work"
     cameras(given.captures, work)
+    wide_baseline(given.captures, given.out)
     cost(work)
     correspondences(given.captures, work)
 
