@@ -89,7 +89,8 @@ def sheet_of(work: Path, name: str, limit: int = 10**6) -> dict[str, Any]:
 
 
 def shown(page: Path, address: str = "") -> Opened:
-    return open_page(page, address, profile=page.parent / "profile")
+    """In a window that is so high that every sheet is near it, whatever fonts the machine has."""
+    return open_page(page, address, profile=page.parent / "profile", height=9000)
 
 
 def test_a_browser_shows_every_sequence_and_complains_of_nothing(work: Path, tmp_path: Path) -> None:
