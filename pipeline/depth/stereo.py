@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pipeline.geometry import Camera, Floats
 
-MAX_DISPARITIES = 224  # levels, a multiple of 16; wider ranges are searched in smaller images
+MAX_DISPARITIES = 160  # levels, a multiple of 16; wider ranges are searched in smaller images, at little loss
 BLOCK = 3  # px, side of the matched block
 RANGE_MARGIN = 0.15  # of the inverse-depth range, added on either side: the sparse points miss the extremes
 BORDER = 8  # px around the rectified region, so that its edge pixels have a neighbourhood
