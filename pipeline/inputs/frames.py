@@ -104,7 +104,9 @@ def extract_frames(
     details: dict[str, Any] = {"frames": len(rows), "kept": len(kept), "dropped": dict(sorted(reasons.items()))}
     details |= {"ordered": ordered, "width": kept[0].width, "height": kept[0].height, "warnings": warnings}
     if source.masks is not None:
-        details["masks"] = import_masks(sequence, source.masks, before_cameras(source, masks or MasksConfig()))
+        read = before_cameras(source, masks or MasksConfig())
+        details["masks"] = import_masks(sequence, source.masks, read, cameras=False)
+        warnings += details["masks"].pop("warnings", [])
     return details
 
 
