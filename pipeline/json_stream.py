@@ -55,7 +55,13 @@ class Element(NamedTuple):
 
 
 def read_elements(
-    path: Path, *, form: Form = "any", largest: int, remedy: str, may_be_gzipped: bool = True
+    path: Path,
+    *,
+    form: Form = "any",
+    largest: int,
+    remedy: str,
+    may_be_gzipped: bool = True,
+    keys: list[str] | None = None,
 ) -> Iterator[Element]:
     """The elements of a JSON file in UTF-8, in the file's order.
 
@@ -63,6 +69,7 @@ def read_elements(
         largest: characters of an element. What is larger is an error; a few times as much memory may be needed.
         remedy: what to do about a file that is cut off, damaged or malformed.
         may_be_gzipped: not where elements are to be read again by their offsets.
+        keys: where given, the object's keys are added to it as they are met, also those of empty lists.
 
     Raises:
         BadInput: the file is absent, cut off, damaged, malformed or of another form; the message says at which row
@@ -80,14 +87,14 @@ def read_elements(
             raise BadInput("is gzipped", where=path, remedy="Unpack it with `gunzip`")
         # a gzip file's checksum is compared when its end is read: `elements` reads on to there
         file = cast(BinaryIO, gzip.GzipFile(fileobj=raw)) if gzipped else raw
-        yield from _JsonText(file, path, largest, remedy).elements(form)
+        yield from _JsonText(file, path, largest, remedy, [] if keys is None else keys).elements(form)
 
 
 class _JsonText:
     """The unread text of a JSON file, and where it lies in the file."""
 
-    def __init__(self, file: BinaryIO, path: Path, largest: int, remedy: str) -> None:
-        self.file, self.path, self.largest, self.remedy = file, path, largest, remedy
+    def __init__(self, file: BinaryIO, path: Path, largest: int, remedy: str, keys: list[str]) -> None:
+        self.file, self.path, self.largest, self.remedy, self.keys = file, path, largest, remedy, keys
         self.text, self.at, self.ended = "", 0, False
         self.skipped = 0
         """Bytes of the file before what stands at `at`, less `at`."""
@@ -118,6 +125,7 @@ class _JsonText:
             if self._next() not in ('"', ""):
                 raise self._malformed("a key is missing")
             self.key, self.number = self._value().value, 0
+            self.keys.append(str(self.key))
             self._take(":")
             if self._next() == "[":
                 yield from self._list()

@@ -77,10 +77,13 @@ def add_masks(
     """Masks of every sequence: imported from `masks[id]` where given, else kept if already there, else by GrabCut."""
     tasks = []
     for sequence in sequences:
-        folder = masks.get(sequence.id)
-        inputs = masks_inputs(_marks(sequence, "frames", "sfm"), folder, config)
-        plan = {"masks": stages.fingerprint("masks", config, inputs)}
-        tasks.append(Task(sequence.folder, ("masks",), plan, mask_one, (folder, config)))
+        folder, plan, refusal = masks.get(sequence.id), {}, None
+        try:
+            inputs = masks_inputs(_marks(sequence, "frames", "sfm"), folder, config)
+            plan = {"masks": stages.fingerprint("masks", config, inputs)}
+        except BadInput as error:
+            refusal = str(error)
+        tasks.append(Task(sequence.folder, ("masks",), plan, mask_one, (folder, config), refusal))
     return run_tasks(tasks, options, watcher or Unwatched())
 
 
@@ -197,11 +200,20 @@ def _marks(sequence: Sequence, *names: str) -> dict[str, str | None]:
 
 
 def masks_inputs(marks: Mapping[str, str | None], masks: Path | None, config: MasksConfig) -> dict[str, Any]:
-    """What the masks stage reads: the stages before it by their fingerprints, and the masks to be imported."""
+    """What the masks stage reads: the stages before it by their fingerprints, and the masks to be imported.
+
+    Raises:
+        BadInput: a file of masks cannot be read.
+    """
+    try:
+        given = None if masks is None else masks_fingerprint(masks)
+    except OSError as error:
+        what, where = f"cannot be read ({error.strerror})", error.filename or masks
+        raise BadInput(what, where=where, remedy="Check its permissions, and that it is still there") from error
     return {
         "frames": marks["frames"],
         "sfm": marks["sfm"],
-        "files": None if masks is None else masks_fingerprint(masks),
+        "files": given,
         "coco_images": _table_fingerprint(config),
     }
 

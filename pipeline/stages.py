@@ -32,7 +32,7 @@ LATER_STAGES = {
 }
 """What must be done again after a stage was run: their markers are removed before it starts."""
 
-STAGE_VERSIONS = {"frames": 2, "sfm": 2, "depth": 2, "masks": 1, "correspond": 2}
+STAGE_VERSIONS = {"frames": 3, "sfm": 2, "depth": 2, "masks": 2, "correspond": 2}
 """Part of each fingerprint. Raise a stage's number by hand in the change that makes it write something else from the
 same input and settings: what an older version wrote is then made again, with all stages after it."""
 

@@ -108,8 +108,12 @@ def write_json(path: Path, value: Any) -> None:
     write_bytes(path, (json.dumps(value, indent=1, ensure_ascii=False) + "\n").encode())
 
 
-def read_json(path: Path) -> Any:
-    """Read JSON. Raises `BadInput` naming the file where it is absent or not JSON."""
+def read_json(path: Path, *, remedy: str = "Delete it and run again") -> Any:
+    """Read JSON. Raises `BadInput` naming the file where it is absent or not JSON.
+
+    Args:
+        remedy: what to do about a file that is not JSON; the default is for files that can be made again.
+    """
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -117,7 +121,7 @@ def read_json(path: Path) -> Any:
     except OSError as error:
         raise BadInput(f"cannot be read ({error.strerror})", where=path) from error
     except (ValueError, UnicodeDecodeError) as error:
-        raise BadInput(f"is not valid JSON ({error})", where=path, remedy="Delete it and run again") from error
+        raise BadInput(f"is not valid JSON ({error})", where=path, remedy=remedy) from error
 
 
 def sha256_of(path: Path) -> str:

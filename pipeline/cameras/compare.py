@@ -12,6 +12,9 @@ from dope.common.errors import BadInput
 from pipeline.geometry import Camera, Floats, rotation_angle_deg, similarity_between
 from pipeline.sequence import Frame
 
+CAMERAS_REMEDY = "Write it again with the tool that it comes from"
+"""What to do about a file of cameras that is damaged: it is the user's own."""
+
 
 @dataclass(frozen=True)
 class CameraErrors:
@@ -40,7 +43,7 @@ def read_reference(path: Path) -> dict[str, Camera]:
         BadInput: not such a file; a frame lacks a field, or has one of a wrong shape.
     """
     cameras = {}
-    content = files.read_json(path)
+    content = files.read_json(path, remedy=CAMERAS_REMEDY)
     if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
         raise BadInput("has no list of `frames`", where=path)
     for number, row in enumerate(content["frames"]):

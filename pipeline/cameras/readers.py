@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from dope.common import files
 from dope.common.errors import BadInput
 from pipeline.cameras import colmap
-from pipeline.cameras.compare import read_reference
+from pipeline.cameras.compare import CAMERAS_REMEDY, read_reference
 from pipeline.geometry import Camera, Floats
 from pipeline.ply import read_ply
 from pipeline.sequence import read_image
@@ -54,7 +54,7 @@ def read_known_cameras(path: Path) -> KnownCameras:
         model = colmap.read_named_model(path)
         found = KnownCameras(model.cameras, model.xyz, model.rgb, f"the COLMAP model {path}")
     else:
-        content = files.read_json(path)
+        content = files.read_json(path, remedy=CAMERAS_REMEDY)
         rows = content.get("frames") if isinstance(content, dict) else None
         if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
             raise BadInput("has no list of `frames`", where=path, remedy="Give a transforms.json or a cameras.json")

@@ -65,9 +65,9 @@ class SequenceAnnotation:
     point_cloud: str | None = None
 
 
-def read_rows(path: Path, form: Form = "list") -> Iterator[Element]:
-    """The rows of one of CO3D's files, plain or gzipped. Raises `BadInput` as `read_elements` does."""
-    return read_elements(path, form=form, largest=LARGEST_ELEMENT, remedy="Download the file again")
+def read_rows(path: Path, form: Form = "list", keys: list[str] | None = None) -> Iterator[Element]:
+    """The rows of one of CO3D's files, plain or gzipped; `keys` as in `read_elements`, which says what is raised."""
+    return read_elements(path, form=form, largest=LARGEST_ELEMENT, remedy="Download the file again", keys=keys)
 
 
 def parse_frame(row: Any) -> tuple[str, FrameAnnotation]:
@@ -76,7 +76,7 @@ def parse_frame(row: Any) -> tuple[str, FrameAnnotation]:
     if not isinstance(number, int) or isinstance(number, bool) or abs(number) > 2**31:
         raise ValueError("has no frame_number")
     image, depth, mask = (_part(row, key) for key in ("image", "depth", "mask"))
-    path, size, scale = _text(image.get("path")), image.get("size"), _number(depth.get("scale_adjustment"))
+    path, size, scale = text_of(image.get("path")), image.get("size"), _number(depth.get("scale_adjustment"))
     height = width = viewpoint = problem = None
     if path is None:
         problem = "redacted (no image path)"
@@ -94,10 +94,10 @@ def parse_frame(row: Any) -> tuple[str, FrameAnnotation]:
         image=path,
         height=height,
         width=width,
-        mask=_text(mask.get("path")),
-        depth=_text(depth.get("path")),
+        mask=text_of(mask.get("path")),
+        depth=text_of(depth.get("path")),
         depth_scale=scale,
-        depth_mask=_text(depth.get("mask_path")),
+        depth_mask=text_of(depth.get("mask_path")),
         viewpoint=viewpoint,
         problem=problem,
     )
@@ -122,7 +122,10 @@ def parse_viewpoint(value: Any) -> Viewpoint:
             raise ValueError(f"viewpoint without a finite {key}")
         numbers[key] = tuple(v for v in parsed if v is not None)
     kind = value.get("intrinsics_format")
-    return Viewpoint(**numbers, intrinsics_format=DEFAULT_INTRINSICS if kind is None else str(kind)[:100])
+    intrinsics_format = DEFAULT_INTRINSICS if kind is None else text_of(kind)
+    if intrinsics_format is None:
+        raise ValueError("viewpoint with a malformed intrinsics_format")
+    return Viewpoint(**numbers, intrinsics_format=intrinsics_format[:100])
 
 
 def parse_sequence(row: Any) -> SequenceAnnotation:
@@ -133,13 +136,13 @@ def parse_sequence(row: Any) -> SequenceAnnotation:
         name,
         viewpoint_quality=_number(row.get("viewpoint_quality_score")),
         point_cloud_quality=_number(cloud.get("quality_score")),
-        point_cloud=_text(cloud.get("path")),
+        point_cloud=text_of(cloud.get("path")),
     )
 
 
 def sequence_name(row: Any) -> str:
     """The name in a row of either file. Raises ValueError."""
-    name = _text(row.get("sequence_name")) if isinstance(row, dict) else None
+    name = text_of(row.get("sequence_name")) if isinstance(row, dict) else None
     if name is None:
         raise ValueError("has no sequence_name" if isinstance(row, dict) else "is not an object")
     return name
@@ -151,7 +154,7 @@ def _part(row: dict[str, Any], key: str) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
-def _text(value: Any) -> str | None:
+def text_of(value: Any) -> str | None:
     """A non-empty text that is valid Unicode, else None."""
     if not isinstance(value, str) or not value:
         return None

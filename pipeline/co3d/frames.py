@@ -25,7 +25,7 @@ from pipeline.inputs.frame_quality import shrink
 from pipeline.inputs.photos import decode, read_jpeg_header
 from pipeline.masks.agreement import forget_check
 from pipeline.masks.imported import MasksConfig, restore_input_masks
-from pipeline.masks.mask_io import read_mask_values, write_masks
+from pipeline.masks.mask_io import listed, read_mask_values, write_masks
 from pipeline.sequence import Frame, Sequence, SequenceInfo, write_image
 
 LICENCE = "CC BY-NC 4.0"
@@ -57,8 +57,8 @@ def extract_frames(source: Co3dSource, sequence: Sequence, config: Co3dFramesCon
     Images of a sequence may differ in size: each frame has its own.
 
     Returns:
-        {"frames", "kept", "dropped": {reason: count}, "ordered", "width", "height", "warnings"}, with "masks"
-        (see `import_masks`) where there are masks.
+        {"frames", "kept", "dropped": {reason: count}, "ordered", "width", "height", "warnings"}, with "masks" and
+        "bad_masks" (see `import_masks`) where there are any.
 
     Raises:
         BadInput: fewer than `min_frames` frames are usable; the message says why. What was in the sequence before is
@@ -78,8 +78,15 @@ def extract_frames(source: Co3dSource, sequence: Sequence, config: Co3dFramesCon
     sequence.write_info(info)
     details: dict[str, Any] = {"frames": len(rows), "kept": len(kept), "dropped": _counted(rows)}
     details |= {"ordered": True, "width": kept[0].width, "height": kept[0].height, "warnings": []}
-    masks, warnings = import_masks(source, sequence, config)
-    details["warnings"] += warnings
+    if numbers := source.not_annotated:
+        named = ", ".join(listed([str(number) for number in numbers]))
+        details["warnings"].append(f"{len(numbers)} frames that the set lists name are not annotated: {named}")
+    masks, bad = import_masks(source, sequence, config)
+    if bad:
+        given = sum(annotations[row.frame].mask is not None for row in kept)
+        first = f"the mask of {rows[min(bad)].source_name} {bad[min(bad)]}"
+        details["warnings"].append(f"{len(bad)} of {given} masks cannot be used: {first}")
+        details["bad_masks"] = bad
     if masks is None:
         info.masks_from = None
         sequence.write_info(info)
@@ -98,22 +105,25 @@ def annotated_camera(annotation: FrameAnnotation) -> Camera:
 
 def import_masks(
     source: Co3dSource, sequence: Sequence, config: Co3dFramesConfig
-) -> tuple[dict[str, Any] | None, list[str]]:
-    """Write masks/ of the frames that have an image; what `write_masks` returns (None without masks), and warnings.
+) -> tuple[dict[str, Any] | None, dict[int, str]]:
+    """Write masks/ of the frames that have an image; a mask that cannot be used costs its frame only.
+
+    Returns:
+        What `write_masks` returns, None without masks; and by frame why its mask cannot be used.
 
     Raises:
         BadInput: all masks are empty.
     """
     annotations, frames = source.frames(config.every), sequence.read_frames()
     given = [(frame, path) for frame in frames if frame.image and (path := annotations[frame.frame].mask) is not None]
-    bad: list[str] = []
+    bad: dict[int, str] = {}
 
     def masks() -> Iterator[tuple[Frame, NDArray[np.bool_]]]:
         for frame, path in given:
             try:
                 yield frame, _mask(source.category, path, frame, config.mask_threshold)
             except BadInput as error:
-                bad.append(f"the mask of {frame.source_name} {error.what}")
+                bad[frame.frame] = error.what
 
     nothing = BadInput("no mask can be used, or all are empty", where=source.path)
     details = None
@@ -123,8 +133,7 @@ def import_masks(
     except BadInput:
         if len(bad) < len(given):  # then they are there, and empty
             raise
-    warnings = [f"{len(bad)} of {len(given)} masks cannot be used: {bad[0]}"] if bad else []
-    return details, warnings
+    return details, bad
 
 
 def restore_masks(source: Co3dSource, sequence: Sequence, config: Co3dFramesConfig) -> None:

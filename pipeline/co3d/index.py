@@ -1,9 +1,9 @@
 """A category's annotations, read once: an SQLite file in WORK/.co3d that gives the frames of a sequence at once.
 
 Frames of a sequence need not lie together in frame_annotations.jgz, and a category can have a million of them: they go
-from the stream into the file, and memory stays small. The file is named after the content of the annotations
-(`files.quick_fingerprint`, which covers the checksum at a gzip file's end), so it is never out of date; all parts of an
-array job share it, and it may be deleted at any time.
+from the stream into the file, and memory stays small. The file is named after the content of the annotations (of a
+gzip file a sample, which covers the checksum at its end; of any other file every byte), so it is never out of date; all
+parts of an array job share it, and it may be deleted at any time.
 """
 
 from __future__ import annotations
@@ -30,9 +30,10 @@ from pipeline.co3d.annotations import (
     read_rows,
 )
 from pipeline.inputs.photos import natural_order
+from pipeline.json_stream import GZIP_MAGIC
 from pipeline.sequence import sequence_id
 
-FORMAT = 1
+FORMAT = 2
 """Changes when what the file holds changes."""
 VIEWPOINT = struct.Struct("<16d")
 """R, T, focal_length, principal_point."""
@@ -127,7 +128,7 @@ def open_index(category: Path, work: Path, tell: Callable[[str], None] = lambda 
     """
     frames, sequences = category / FRAMES_FILE, category / SEQUENCES_FILE
     try:
-        marks = [files.quick_fingerprint(path) if path.exists() else "absent" for path in (frames, sequences)]
+        marks = [_content_mark(path) if path.exists() else "absent" for path in (frames, sequences)]
     except OSError as error:
         raise BadInput(f"cannot be read ({error.strerror})", where=error.filename or category) from error
     mark = hashlib.sha256(f"{FORMAT}\0{marks[0]}\0{marks[1]}".encode()).hexdigest()[:16]
@@ -141,6 +142,13 @@ def open_index(category: Path, work: Path, tell: Callable[[str], None] = lambda 
         with files.atomic_path(index.path) as partial:
             _build(partial, frames, sequences if sequences.exists() else None)
     return index
+
+
+def _content_mark(path: Path) -> str:
+    """Identifies the content of an annotation file, whichever byte of it changes."""
+    with path.open("rb") as file:
+        gzipped = file.read(len(GZIP_MAGIC)) == GZIP_MAGIC
+    return files.quick_fingerprint(path) if gzipped else files.sha256_of(path)
 
 
 def _build(path: Path, frames: Path, sequences: Path | None) -> None:

@@ -88,6 +88,9 @@ def _no_images(source: Co3dSource, n_frames: int, present: int) -> str | None:
     """A sequence that was not downloaded, or is not in the chosen sets, is refused without starting a process."""
     if present:
         return None
+    if not n_frames and (numbers := source.not_annotated) and len(numbers) == len(set(source.members or ())):
+        what = f"not one of the {len(numbers)} frames that the set lists name is annotated"
+        return str(BadInput(what, where=source.path, remedy=f"Download {source.category.name} again"))
     what = f"not one of its {n_frames} frames' images is there" if n_frames else "no frame of the chosen sets is taken"
     remedy = f"Download the rest of {source.category.name}" if n_frames else "Take more frames with a smaller --every"
     return str(BadInput(what, where=source.path, remedy=remedy))

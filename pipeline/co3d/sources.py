@@ -68,6 +68,13 @@ class Co3dSource:
         """The sequence's folder, as a name of the source; it need not be there."""
         return self.category.folder.absolute() / self.annotation.name
 
+    @property
+    def not_annotated(self) -> list[int]:
+        """Frame numbers that the set lists name and the annotations do not."""
+        if self.members is None:
+            return []
+        return sorted(set(self.members) - {row[0] for row in self.index.rows(self.indexed)})
+
     def frames(self, every: int) -> list[FrameAnnotation]:
         """The frames that are wanted: of the chosen sets, and every k-th by frame number from the first on."""
         return [frame_of(row) for row in self.rows(every)]
@@ -111,6 +118,7 @@ def find_co3d(
         except BadInput as error:  # the other categories go on
             failed.append(_row(category.name, "failed", str(error)))
             continue
+        faults += members.faults if members is not None else []
         failed += [_row(category.name, "failed", _fault(category, *fault)) for fault in faults]
         chosen, bad, out = _choose(category, index, sequences, members, choice, taken)
         sources, failed, left_out = sources + chosen, failed + bad, left_out + out
@@ -176,7 +184,7 @@ def _choose(
         number = co3d_id(category.name, name)
         if choice.sequences and name not in choice.sequences and number not in choice.sequences:
             continue
-        if members is not None and name not in members:
+        if members is not None and name not in members.numbers:
             continue  # not part of what was asked for
         if (reason := _too_poor(sequence.annotation, choice)) is not None:
             left_out.append(_row(number, "empty", reason, name))
@@ -189,8 +197,14 @@ def _choose(
             failed.append(_row(number, "failed", reason, name))
         else:
             taken[number.casefold()] = f"'{name}' of {category.name}"
-            allowed = None if members is None else members[name]
+            allowed = None if members is None else members.numbers[name]
             chosen.append(Co3dSource(category, index, sequence, number, allowed))
+    annotated = {sequence.annotation.name for sequence in sequences}
+    for name in members.numbers if members is not None else ():
+        number = co3d_id(category.name, name)
+        if name not in annotated and (not choice.sequences or name in choice.sequences or number in choice.sequences):
+            reason = f"{category.folder}: its set lists name the sequence '{name}', its annotations do not"
+            failed.append(_row(number, "failed", f"{reason}. Download the category again", name))
     return chosen, failed, left_out
 
 

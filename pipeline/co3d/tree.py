@@ -10,15 +10,23 @@ ROOT/<category>/<sequence>/images, masks, depths, depth_masks, pointcloud.ply
 from __future__ import annotations
 
 from array import array
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-from dope.common.errors import BadInput, UsageError
-from pipeline.co3d.annotations import read_rows
+from dope.common.errors import BadInput, UsageError, legible
+from pipeline.co3d.annotations import read_rows, text_of
 from pipeline.co3d.index import FRAMES_FILE
 
-Members = dict[str, "array[int]"]
-"""Frame numbers by sequence."""
+
+@dataclass
+class Members:
+    """What the chosen sets of the set lists name."""
+
+    numbers: dict[str, array[int]] = field(default_factory=dict)
+    """Frame numbers by sequence."""
+    faults: list[tuple[str, int, str]] = field(default_factory=list)
+    """(file, row from 1, what) of entries that name no frame; the first of each set stands for all."""
 
 
 class NoSuchSet(BadInput):
@@ -60,28 +68,37 @@ class Category:
         return [found[name] for name in subsets or sorted(found)]
 
     def members(self, subsets: list[str], sets: list[str]) -> Members | None:
-        """The frames that the set lists name, or None where neither subsets nor sets are asked for.
+        """The frames that the chosen sets name, or None where neither subsets nor sets are asked for.
 
         Args:
             subsets: v2: names of set lists ("fewview_dev"); v1: names of sets in the one list ("train_known").
             sets: names of sets in those lists ("train", "train_known"); empty = all.
 
         Raises:
-            NoSuchSet: a subset or set that is not there.
+            NoSuchSet: a subset or set that is not there, or sets that are all empty.
             BadInput: a set list that is damaged.
         """
         if not subsets and not sets:
             return None
         wanted = set(sets) | (set(subsets) if self.version == 1 else set())
-        names, members = set[str](), Members()
+        names, members = list[str](), Members()
         for path in self.set_list_files(subsets):
-            for name, _, entry, *_ in read_rows(path, "lists"):
-                names.add(str(name))
-                if (not wanted or name in wanted) and _is_entry(entry):
-                    members.setdefault(entry[0], array("q")).append(entry[1])
-        if missing := sorted(wanted - names):
-            there = ", ".join(sorted(names)) or "none"
+            faulty = set[str | None]()
+            for name, number, entry, *_ in read_rows(path, "lists", names):
+                if wanted and name not in wanted:
+                    continue
+                if _is_entry(entry):
+                    members.numbers.setdefault(entry[0], array("q")).append(entry[1])
+                elif name not in faulty:
+                    faulty.add(name)
+                    what = f"of set {legible(str(name))} is no [sequence, frame number, path]"
+                    members.faults.append((str(path.relative_to(self.folder)), number + 1, what))
+        there = ", ".join(sorted({legible(name) for name in names})) or "none"
+        if missing := sorted(wanted - set(names)):
             raise NoSuchSet(f"no set {', '.join(missing)} in its set lists (there are: {there})", where=self.folder)
+        if not members.numbers and not members.faults:
+            what = f"set {', '.join(sorted(wanted)) or there} names no frame in its set lists"
+            raise NoSuchSet(what, where=self.folder)
         return members
 
     def resolve(self, given: str) -> Path:
@@ -110,13 +127,15 @@ class Category:
 
 
 def find_categories(root: Path, names: list[str]) -> tuple[list[Category], list[tuple[str, str]]]:
-    """The categories of a download, of all or the named ones, and (name, reason) of those that are not there.
+    """The categories of a download, of all or the named ones, and (name, reason) of those that cannot be used.
 
     Raises:
-        UsageError: `root` is no CO3D download.
+        UsageError: `root` is no CO3D download, or its name cannot be written down.
     """
     if not root.is_dir():
         raise UsageError("no such folder", where=root)
+    if not _is_legible(root.absolute()):
+        raise UsageError("its name is not UTF-8", where=root, remedy="Rename it")
     if (root / FRAMES_FILE).is_file():
         name = root.absolute().name
         remedy = f"Give the folder above it, with --category {name}"
@@ -125,9 +144,23 @@ def find_categories(root: Path, names: list[str]) -> tuple[list[Category], list[
     if not there:
         raise UsageError(f"holds no <category>/{FRAMES_FILE}", where=root, remedy="Give the folder of a CO3D download")
     chosen = list(dict.fromkeys(names)) or there
-    listed = f"{', '.join(there[:10])}{' ...' if len(there) > 10 else ''}"
-    missing = [(name, f"{root}: no category '{name}' (there are: {listed})") for name in chosen if name not in there]
-    return [Category(root, name) for name in chosen if name in there], missing
+    listed = f"{', '.join(map(legible, there[:10]))}{' ...' if len(there) > 10 else ''}"
+    usable: list[Category] = []
+    unusable: list[tuple[str, str]] = []
+    for name in chosen:
+        shown = legible(name)
+        if name not in there:
+            unusable.append((shown, f"{root}: no category '{shown}' (there are: {listed})"))
+        elif _is_legible(name):
+            usable.append(Category(root, name))
+        else:
+            unusable.append((shown, f"{root / shown}: its name is not UTF-8. Rename it"))
+    return usable, unusable
+
+
+def _is_legible(name: str | Path) -> bool:
+    """Can a file's name be written as UTF-8 text, into annotations' index and into sequence.json?"""
+    return legible(name) == str(name)
 
 
 def is_inside(given: str) -> bool:
@@ -135,11 +168,8 @@ def is_inside(given: str) -> bool:
     return bool(given) and not given.startswith("/") and ".." not in given.split("/") and "\0" not in given
 
 
-def _is_entry(entry: object) -> bool:
-    return (
-        isinstance(entry, list)
-        and len(entry) >= 2
-        and isinstance(entry[0], str)
-        and isinstance(entry[1], int)
-        and abs(entry[1]) <= 2**31
-    )
+def _is_entry(entry: Any) -> bool:
+    """Is it [sequence, frame number, ...]?"""
+    if not isinstance(entry, list) or len(entry) < 2 or text_of(entry[0]) is None:
+        return False
+    return isinstance(entry[1], int) and not isinstance(entry[1], bool) and abs(entry[1]) <= 2**31

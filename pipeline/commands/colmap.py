@@ -114,7 +114,8 @@ def colmap(
 ) -> None:
     """Frames, cameras and depth maps of videos and photo folders, one sequence each.
 
-    A folder with an images/ folder in it is one sequence; a folder of videos or of photo folders is many.
+    A folder with an images/ folder in it is one sequence; a folder of videos or of photo folders is many. Folders are
+    searched to any depth; those named masks, depths or segmentations, and those given, are no captures.
 
     Examples:
 

@@ -90,7 +90,8 @@ def masks(
     """The object's mask in every frame: imported, or cut out by GrabCut around the sparse points.
 
     Masks are PNGs of any bit depth, matched by the frame's file name (or number, for videos), of the size of the
-    source image or of the stored one. A tool that finds many instances in an image (detectron2's PointRend, FreeSOLO)
+    source image or of the stored one. Where their size does not tell, --set lying=yes says that they lie as the photos
+    do without their EXIF orientation. A tool that finds many instances in an image (detectron2's PointRend, FreeSOLO)
     hands over one JSON file of them; --pick says which one of a frame is the object.
 
     Where there are cameras, every mask is compared with the visual hull of the other views'; those that disagree are

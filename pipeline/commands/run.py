@@ -185,7 +185,12 @@ def _items(
     if not inputs and (given := next((name for name, value in beside.items() if value), None)):
         raise UsageError(f"{given} come with an INPUT, and none was given", remedy="Name the videos or photo folders")
     sources, errors = find_sources(
-        inputs, category=category, category_from=category_from, known=known_sources(out), **beside
+        inputs,
+        category=category,
+        category_from=category_from,
+        masks_later=masks_from,
+        known=known_sources(out),
+        **beside,
     )
     held = [] if inputs else chosen_sequences(out, None)
     there = [sequence.id for sequence in find_sequences(out)] if out.is_dir() else []

@@ -14,7 +14,7 @@ from pipeline.depth.readers import READERS, read_depth_file
 from pipeline.depth.resample import distortion_px, redistorted, reduced
 from pipeline.depth.stereo import Depth, pixel_rays
 from pipeline.geometry import Camera
-from pipeline.inputs.photos import natural_order, read_jpeg_header, turn_upright
+from pipeline.inputs.photos import natural_order, read_orientation, turn_upright
 from pipeline.sequence import Frame, Sequence
 
 NEGLIGIBLE_PX = 0.5  # lens distortion that moves no pixel of a depth map farther than this
@@ -96,8 +96,7 @@ class FolderDepths:
         if (width > height) == (frame.width > frame.height):
             return depth
         photo = self._photos / frame.source_name
-        header = read_jpeg_header(photo.read_bytes()) if photo.is_file() else None
-        return depth if header is None else turn_upright(depth, header.orientation)
+        return turn_upright(depth, read_orientation(photo))
 
 
 def match_depth_files(frames: list[Frame], folder: Path, *, by_number: bool) -> dict[int, Path]:

@@ -13,7 +13,7 @@ from typing import Any, Literal
 from dope.common import files, settings
 from dope.common.errors import BadInput, legible
 from pipeline.inputs.frame_quality import Look, QualityConfig, look_at, neighbours_are_alike, reasons_to_drop, shrink
-from pipeline.inputs.photos import list_photos, read_photo
+from pipeline.inputs.photos import list_photos, read_photo, unsupported_photos
 from pipeline.inputs.sources import Source
 from pipeline.inputs.videos import Video, Windows
 from pipeline.masks.imported import MasksConfig, import_masks
@@ -80,6 +80,8 @@ def extract_frames(
             taken = list(_take_video(source.path, folder, config, warnings))
         else:
             taken = list(_take_photos(source.path, folder, config))
+            if unsupported := unsupported_photos(source.path):
+                warnings.append(_left_out(unsupported))
         _judge(taken, source, config)
         rows = [item.row for item in taken]
         kept = [row for row in rows if row.dropped is None]
@@ -102,7 +104,9 @@ def extract_frames(
     details: dict[str, Any] = {"frames": len(rows), "kept": len(kept), "dropped": dict(sorted(reasons.items()))}
     details |= {"ordered": ordered, "width": kept[0].width, "height": kept[0].height, "warnings": warnings}
     if source.masks is not None:
-        details["masks"] = import_masks(sequence, source.masks, before_cameras(source, masks or MasksConfig()))
+        read = before_cameras(source, masks or MasksConfig())
+        details["masks"] = import_masks(sequence, source.masks, read, cameras=False)
+        warnings += details["masks"].pop("warnings", [])
     return details
 
 
@@ -209,6 +213,13 @@ def _is_ordered(source: Source, looks: list[Look], config: FramesConfig) -> bool
     return source.kind == "video" or neighbours_are_alike(looks)
 
 
+def _left_out(unsupported: list[Path]) -> str:
+    counts = Counter(path.suffix[1:].upper() for path in unsupported)
+    listed = ", ".join(f"{count} {kind}" for kind, count in sorted(counts.items()))
+    first = legible(unsupported[0].name)
+    return f"{listed} files were left out ({first} ...): these kinds are not supported, convert them to JPEG"
+
+
 def _too_few(rows: list[Frame], kept: int, source: Source, config: FramesConfig) -> BadInput:
     """The error that names what is wrong with most of the frames."""
     if not rows:
@@ -230,6 +241,8 @@ def _too_few(rows: list[Frame], kept: int, source: Source, config: FramesConfig)
         what, remedy = f"the photos have different sizes: {total}", "Give each size a folder of its own"
     elif worst == "not sampled":
         remedy = "Take more of the photos: a smaller --every, a larger --count"
+    elif source.kind == "photos" and (unsupported := unsupported_photos(source.path)):
+        remedy = _left_out(unsupported)
     return BadInput(f"{what} ({listed})" if listed else what, where=source.path, remedy=remedy)
 
 

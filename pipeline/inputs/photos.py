@@ -19,6 +19,8 @@ from pipeline.inputs.image_size import PNG_MAGIC, refuse_huge
 
 PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
 UNSUPPORTED_PHOTOS = frozenset({".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".gif"})
+EXIF_WITHIN = 1 << 20
+"""Bytes at a JPEG's start that hold its EXIF block: it is one of the first segments, each of 64 KiB at most."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,17 @@ def list_photos(folder: Path) -> list[Path]:
     """The photos of a folder in natural order of their names; hidden files and other files are not photos."""
     names = (path for path in folder.iterdir() if path.suffix.lower() in PHOTO_SUFFIXES)
     return sorted((path for path in names if not path.name.startswith(".") and path.is_file()), key=natural_order)
+
+
+def unsupported_photos(folder: Path) -> list[Path]:
+    """Files of a folder that are photos of a kind that cannot be read, in natural order.
+
+    A raw file that has a readable photo of the same name beside it, as cameras write them in pairs, is not among them.
+    """
+    twins = {path.stem for path in list_photos(folder)}
+    paths = (path for path in folder.iterdir() if path.suffix.lower() in UNSUPPORTED_PHOTOS)
+    lost = (path for path in paths if not path.name.startswith(".") and path.stem not in twins and path.is_file())
+    return sorted(lost, key=natural_order)
 
 
 def read_photo(path: Path, long_side: int) -> Photo:
@@ -83,6 +96,15 @@ def read_photo(path: Path, long_side: int) -> Photo:
     as_it_is = upright and factor == 1 and resized is upright_image
     focal = None if header is None else header.exif.focal_px(resized.shape[1], resized.shape[0])
     return Photo(resized, (width * factor, height * factor), data if as_it_is else None, focal)
+
+
+def read_orientation(path: Path) -> int:
+    """How a photo must be turned to be upright: its EXIF orientation 1-8; 1 too where there is no such JPEG."""
+    if not path.is_file():
+        return 1
+    with path.open("rb") as file:
+        header = read_jpeg_header(file.read(EXIF_WITHIN))
+    return 1 if header is None else header.orientation
 
 
 def decode(data: bytes, flags: int) -> NDArray[Any]:

@@ -5,6 +5,10 @@ fox/0001.jpg ...            one sequence (a folder of photos)
 fox/images/ + fox/masks/    one sequence named `fox`: a folder that holds `images` with photos is one capture
 videos/*.mov                one sequence a video
 <category>/<instance>.mp4   any depth of folders above videos and captures
+
+A folder of videos or photos is searched further below, too: of captures/cover.jpg and captures/a/1.jpg ... become two
+sequences, `captures` and `a`. What lies beside `images` is not, nor are folders of masks and depth maps (`NOT_PHOTOS`,
+and beside photos and videos those that are given).
 """
 
 from __future__ import annotations
@@ -18,7 +22,7 @@ from typing import Any, Literal
 
 from dope.common import files
 from dope.common.errors import BadInput, UsageError, legible
-from pipeline.inputs.photos import PHOTO_SUFFIXES, UNSUPPORTED_PHOTOS, list_photos, natural_order
+from pipeline.inputs.photos import PHOTO_SUFFIXES, UNSUPPORTED_PHOTOS, list_photos, natural_order, unsupported_photos
 from pipeline.sequence import find_sequences, sequence_id
 from pipeline.stages import StageResult
 
@@ -71,6 +75,7 @@ def find_sources(
     masks: str | None = None,
     cameras: str | None = None,
     depths: str | None = None,
+    masks_later: str | None = None,
     known: Mapping[Path, str] | None = None,
 ) -> tuple[list[Source], list[SourceError]]:
     """The sequences that the paths on a command line stand for, and a row for each path that stands for none.
@@ -84,27 +89,25 @@ def find_sources(
             stands for the capture's folder or the video's path without its suffix (`{}/masks`, `{}_masks`).
         cameras: the same for cameras to reuse: a file, or a COLMAP model's folder.
         depths: the same for folders of depth maps.
+        masks_later: masks that are imported after reconstruction: no capture where they lie beside photos.
         known: ids of the sources that WORK holds already (`known_sources`): they keep them, whatever else is given.
 
     Returns:
-        Sources with unique ids (the parent's name is prefixed where two are the same), and (id, path, error) rows.
+        Sources with unique ids (the parent's name is prefixed where two are the same), and (id, path, error) rows: of
+        inputs, and of folders below them, that cannot be used.
     """
     if category_from not in ("none", "parent"):
         raise UsageError(f"'{category_from}' is not one of none, parent", where="--category-from")
     found: list[Source] = []
     errors: list[SourceError] = []
     seen: set[Path] = set()
+    patterns = {name: given for name, given in (("masks", masks), ("cameras", cameras), ("depths", depths)) if given}
+    pictures = [given for given in (masks, depths, masks_later) if given]
     for path in inputs:
-        try:
-            sources = list(_expand(path, set(), top=True))
-        except BadInput as error:
-            errors.append((_name(path), path, error))
-            continue
-        except OSError as error:  # a folder below that may not be read
-            unreadable = BadInput(f"cannot be read ({error.strerror})", where=error.filename or path)
-            errors.append((_name(path), path, unreadable))
-            continue
-        for source in sources:
+        for source in _sources_or_error(path, set(), pictures, top=True):
+            if not isinstance(source, Source):
+                errors.append(source)
+                continue
             place = source.path.resolve()
             if place in seen:  # the same video given twice is one sequence
                 continue
@@ -115,12 +118,11 @@ def find_sources(
                 unwritable = BadInput("its name is not UTF-8", where=source.path, remedy="Rename it")
                 errors.append((source.id, source.path, unwritable))
     found = [_labelled(source, category, category_from) for source in _with_unique_ids(found, known or {})]
-    patterns = {"masks": masks, "cameras": cameras, "depths": depths}
     kept: list[Source] = []
     for source in found:
         try:
             several = len(found) > 1
-            beside: dict[str, Any] = {name: _beside(source, name, p, several) for name, p in patterns.items() if p}
+            beside: dict[str, Any] = {name: _beside(source, name, p, several) for name, p in patterns.items()}
         except BadInput as error:
             errors.append((source.id, source.path, error))
         else:
@@ -161,6 +163,8 @@ def source_fingerprint(source: Source) -> dict[str, Any]:
             value["files"] = files.quick_fingerprint(source.path)
         else:
             value["files"] = folder_fingerprint(source.path)
+            if unsupported := unsupported_photos(source.path):
+                value["unsupported"] = [legible(path.name) for path in unsupported]
         if source.masks is not None:
             value["masks"] = masks_fingerprint(source.masks)
         for name, place in (("cameras", source.cameras), ("depths", source.depths)):
@@ -198,8 +202,31 @@ def place_fingerprint(place: Path, *, whole: bool = False) -> str:
     return f"{len(paths)}:{digest.hexdigest()}"
 
 
-def _expand(path: Path, above: set[Path], *, top: bool) -> Iterator[Source]:
-    """The sources at or below `path`. Raises `BadInput` where the path given by the user (`top`) holds none."""
+def _sources_or_error(
+    path: Path, above: set[Path], beside: list[str], *, top: bool = False
+) -> Iterator[Source | SourceError]:
+    """The sources at or below `path`, and a row where it cannot be used: never a reason to leave out its neighbours."""
+    try:
+        yield from _expand(path, above, beside, top=top)
+    except BadInput as error:
+        yield _name(path), path, error
+    except OSError as error:
+        unreadable = BadInput(f"cannot be read ({error.strerror})", where=error.filename or path)
+        yield _name(path), path, unreadable
+
+
+def _expand(path: Path, above: set[Path], beside: list[str], *, top: bool) -> Iterator[Source | SourceError]:
+    """The sources at or below `path`.
+
+    Args:
+        above: the folders that it was found in.
+        beside: where pictures lie that are no photos, as given: beside photos or videos, these are no captures.
+        top: the user named it.
+
+    Raises:
+        BadInput: it cannot be used. That it holds no source is one only where the user named it, or where it holds
+            photos of a kind that cannot be read.
+    """
     if not path.exists():
         raise BadInput("no such file or folder", where=path, remedy="Check how it is spelt")
     if path.is_file():
@@ -229,13 +256,16 @@ def _expand(path: Path, above: set[Path], *, top: bool) -> Iterator[Source]:
         yield _source(path, "photos")
     below = False
     place = path.resolve()
-    if not has_photos and place not in above:  # a link to a folder above would never end
+    if place not in above:  # a link to a folder above would never end
+        homes = [*([path] if has_photos else []), *(video.with_suffix("") for video in videos)]
+        given = {Path(pattern.replace("{}", str(home))).resolve() for pattern in beside for home in homes}
         for entry in entries:
-            if entry.is_dir() and entry.name.lower() not in NOT_PHOTOS:
-                for source in _expand(entry, above | {place}, top=False):
+            if entry.is_dir() and entry.name.lower() not in NOT_PHOTOS and entry.resolve() not in given:
+                for source in _sources_or_error(entry, above | {place}, beside):
                     below = True
                     yield source
-    if top and not (videos or has_photos or below):
+    foreign = any(entry.suffix.lower() in UNSUPPORTED_PHOTOS for entry in entries)
+    if (top or foreign) and not (videos or has_photos or below):
         what = "holds neither photos nor videos" if entries else "is an empty folder"
         raise BadInput(what, where=path, remedy=_remedy(entries))
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
+from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import Literal
 
@@ -28,8 +29,17 @@ Found = dict[int, ImageKey]
 """Image of each frame, by the frame's index."""
 
 
-def match_images(sequence: Sequence, frames: list[Frame], results: Results, names: Names, *, shared: bool) -> Found:
-    """The image of each frame that has one, by the frame's index.
+@dataclass(frozen=True)
+class Matched:
+    """Which image is which frame, and whose name it has."""
+
+    images: Found
+    names: Literal["source", "stored", "either"]
+    """Whose names the images have; "either" where source and stored images are called the same."""
+
+
+def match_images(sequence: Sequence, frames: list[Frame], results: Results, names: Names, *, shared: bool) -> Matched:
+    """The image of each frame that has one.
 
     Args:
         shared: the file holds results of several sequences, so a bare name or number says nothing.
@@ -57,8 +67,8 @@ def match_images(sequence: Sequence, frames: list[Frame], results: Results, name
     for number in numbers:
         sources.add_number(number)
         stored.add_number(number)
-    found = _chosen(sources, stored, names)
-    if not found:
+    matched = _chosen(sources, stored, names)
+    if not matched.images:
         raise _nothing_found(frames, results, of_sequence, by_number, sequence.id, shared)
     unknown = [number for number in numbers if number not in sources.known and number not in stored.known]
     if unknown and not by_number:
@@ -67,7 +77,7 @@ def match_images(sequence: Sequence, frames: list[Frame], results: Results, name
             where=results.path,
             remedy="Give the table of images with --coco-images",
         )
-    return found
+    return matched
 
 
 class _Lookup:
@@ -141,11 +151,11 @@ def _names(file_name: str, name: str) -> bool:
     return any(span.casefold() == name.casefold() for span in spans)
 
 
-def _chosen(sources: _Lookup, stored: _Lookup, names: Names) -> Found:
+def _chosen(sources: _Lookup, stored: _Lookup, names: Names) -> Matched:
     if names == "source" or (names == "auto" and (stored.strangers or not stored.found)):
-        return sources.found
+        return Matched(sources.found, "source")
     if names == "stored" or len(stored.found) > len(sources.found):
-        return stored.found
+        return Matched(stored.found, "stored")
     if len(stored.found) == len(sources.found) and stored.found != sources.found:
         index = next(index for index in stored.found if stored.found[index] != sources.found.get(index))
         raise BadInput(
@@ -153,7 +163,7 @@ def _chosen(sources: _Lookup, stored: _Lookup, names: Names) -> Found:
             where=sources.where,
             remedy="Say which with --set names=stored or --set names=source",
         )
-    return sources.found
+    return Matched(sources.found, "either" if stored.found == sources.found else "source")
 
 
 def _nothing_found(

@@ -25,9 +25,10 @@ from dope.common.errors import BadInput
 from pipeline.inputs.photos import list_photos
 from pipeline.masks.agreement import forget_check
 from pipeline.masks.coco import picked_masks
+from pipeline.masks.fit import Lying, MaskFit
 from pipeline.masks.grabcut import GrabCutConfig
 from pipeline.masks.image_names import Names
-from pipeline.masks.mask_io import fit_to_frame, read_mask_values, write_masks
+from pipeline.masks.mask_io import read_mask_values, write_masks
 from pipeline.masks.pick import Pick
 from pipeline.masks.visual_hull import HullConfig
 from pipeline.sequence import Frame, Sequence
@@ -39,6 +40,9 @@ class MasksConfig:
 
     threshold: float = 0.5
     """Object is above this share of the largest value that the mask's type can hold."""
+    lying: Lying = "auto"
+    """Do masks lie as the photos' pixels do before their EXIF orientation is applied? "auto": where their size says so,
+    which it cannot for square photos and for those that are mirrored or upside down (`pipeline.masks.fit`)."""
     min_share: float = 0.0005
     """A mask with a smaller share of object pixels is empty."""
     pick: Pick = "consistent"
@@ -65,21 +69,24 @@ class MasksConfig:
     """How the object is cut out where no masks are given."""
 
 
-def import_masks(sequence: Sequence, place: Path, config: MasksConfig) -> dict[str, Any]:
+def import_masks(sequence: Sequence, place: Path, config: MasksConfig, *, cameras: bool = True) -> dict[str, Any]:
     """Write masks/ for the frames that have an image and note them in frames.parquet.
 
     Of a folder, a mask belongs to a photo `IMG_1.jpg` as `IMG_1.png` or `IMG_1.jpg.png`, to a video's frame by the last
     number in its name, the frame's number from 0 (`000123.png`, `frame_000123.png`). A file is taken for COCO results;
     `pipeline.masks.image_names` says which image is which frame. A mask has the size of the source image or of the
-    stored one, and is upright, or lies as the photo's pixels do before its EXIF orientation is applied.
+    stored one, and is upright, or lies as the photo's pixels do before its EXIF orientation is applied, as
+    `config.lying` says.
 
     Args:
         place: a folder of mask files, or a file of results.
+        cameras: may the frames' cameras help to pick an instance? Never for masks that come with the input: those are
+            read before there are cameras, and must be the same when they are read again later.
 
     Returns:
-        {"masks", "missing", "empty", "mean_share"}, with "missing_frames" and "empty_frames" (names) where there are
-        any, and for results `picked_masks`' details. A frame without a mask has none in frames.parquet; an empty mask
-        is written as it is.
+        {"masks", "missing", "empty", "mean_share"}, with "missing_frames" and "empty_frames" (names) and "warnings"
+        where there are any, and for results `picked_masks`' details. A frame without a mask has none in
+        frames.parquet; an empty mask is written as it is.
 
     Raises:
         BadInput: no such place, a mask that cannot be read or has another size, no mask matches, all are empty.
@@ -89,23 +96,25 @@ def import_masks(sequence: Sequence, place: Path, config: MasksConfig) -> dict[s
     shown = [frame for frame in frames if frame.image is not None]
     more: dict[str, Any] = {}
     if place.is_file():
-        more, masks = picked_masks(sequence, shown, place, config, shared=config.shared)
+        more, masks, fit = picked_masks(sequence, shown, place, config, cameras=cameras)
         remedy = "Lower --min-score, or see --pick"
     elif place.is_dir():
-        masks = _folder_masks(sequence, shown, place, config)
+        fit = MaskFit(Path(sequence.read_info().source), config.lying)
+        masks = _folder_masks(sequence, shown, place, config, fit)
         remedy = "Object pixels are bright, the others black"
     else:
         raise BadInput("no such folder or file of masks", where=place)
     nothing = BadInput("all masks are empty", where=place, remedy=remedy)
-    return write_masks(sequence, frames, masks, min_share=config.min_share, nothing=nothing) | more
+    details = write_masks(sequence, frames, masks, min_share=config.min_share, nothing=nothing)
+    warnings = [*more.pop("warnings", []), *fit.warnings()]
+    return details | more | ({"warnings": warnings} if warnings else {})
 
 
 def _folder_masks(
-    sequence: Sequence, frames: list[Frame], folder: Path, config: MasksConfig
+    sequence: Sequence, frames: list[Frame], folder: Path, config: MasksConfig, fit: MaskFit
 ) -> Iterator[tuple[Frame, NDArray[np.bool_]]]:
     """The masks of a folder, of the stored size."""
-    info = sequence.read_info()
-    by_number = info.kind == "video"
+    by_number = sequence.read_info().kind == "video"
     found = _match(frames, folder, by_number=by_number)
     if not found:
         names = ", ".join(frame.source_name for frame in frames[:3])
@@ -116,7 +125,7 @@ def _folder_masks(
         if frame.frame in found:
             path = found[frame.frame]
             try:
-                yield frame, fit_to_frame(read_mask_values(path) > cutoff, frame, Path(info.source))
+                yield frame, fit.fit(read_mask_values(path) > cutoff, frame)
             except BadInput as error:
                 raise BadInput(error.what, where=path, remedy=error.remedy) from error
 
@@ -131,7 +140,7 @@ def restore_input_masks(sequence: Sequence, place: Path | None, config: MasksCon
     if not info.masks_are_later:
         return
     if place is not None:
-        import_masks(sequence, place, config)
+        import_masks(sequence, place, config, cameras=False)
     else:
         frames = sequence.read_frames()
         for frame in frames:
@@ -143,7 +152,7 @@ def restore_input_masks(sequence: Sequence, place: Path | None, config: MasksCon
 
 
 def _match(frames: list[Frame], folder: Path, *, by_number: bool) -> dict[int, Path]:
-    """Mask files of frames, by frame index."""
+    """Mask files of frames, by frame index. Raises `BadInput` where two files have the number of one frame."""
     named: dict[str, Path] = {}
     for path in list_photos(folder):
         # what COLMAP expects (a.jpg.png) and what most tools write (a.png); PNG wins over the lossy kinds
@@ -152,7 +161,18 @@ def _match(frames: list[Frame], folder: Path, *, by_number: bool) -> dict[int, P
     if not by_number:
         pairs = ((frame, named.get(frame.source_name, named.get(Path(frame.source_name).stem))) for frame in frames)
         return {frame.frame: path for frame, path in pairs if path is not None}
-    numbered = {int(digits[-1]): path for stem, path in named.items() if (digits := re.findall(r"\d+", stem))}
+    numbered: dict[int, Path] = {}
+    for stem, path in named.items():
+        if not (digits := re.findall(r"\d+", stem)):
+            continue
+        before = numbered.setdefault(int(digits[-1]), path)
+        if before != path:
+            raise BadInput(
+                f"{before.name} and {path.name} are both masks of frame {int(digits[-1])}, by the last number in their "
+                "names",
+                where=folder,
+                remedy="Put the frame's number last, and give one mask for each frame",
+            )
     return {f.frame: numbered[int(f.source_name)] for f in frames if int(f.source_name) in numbered}
 
 

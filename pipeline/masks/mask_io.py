@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dope.common import files
 from dope.common.errors import BadInput
-from pipeline.inputs.photos import decode, read_jpeg_header, turn_upright
+from pipeline.inputs.photos import decode
 from pipeline.sequence import Frame, Sequence, write_image
 
 LISTED = 10
@@ -38,42 +38,6 @@ def read_mask_values(path: Path) -> NDArray[np.float32]:
         colours = image[..., :-1] if alpha is not None else image
         image = alpha if alpha is not None and informative else colours.max(axis=2)
     return (image / np.float32(largest)).astype(np.float32)
-
-
-def source_size(frame: Frame) -> tuple[int, int]:
-    """(width, height) of the source image, upright; of the stored one where that is not known."""
-    return frame.source_width or frame.width, frame.source_height or frame.height
-
-
-def fits_frame(shape: tuple[int, ...], frame: Frame) -> bool:
-    """Has a mask (height, width) the size of the stored or of the source image, upright or lying?"""
-    sizes = {(frame.width, frame.height), source_size(frame)}
-    return (shape[1], shape[0]) in sizes or (shape[0], shape[1]) in sizes
-
-
-def fit_to_frame(mask: NDArray[np.bool_], frame: Frame, photos: Path) -> NDArray[np.bool_]:
-    """A mask of a frame's source image brought to the size of the stored one. Raises `BadInput` without a file's name.
-
-    Args:
-        photos: the folder of the source's photos, whose EXIF orientation a mask may have to be turned by.
-    """
-    stored, source = (frame.width, frame.height), source_size(frame)
-    size = (mask.shape[1], mask.shape[0])
-    if size not in (stored, source) and size[::-1] in (stored, source):
-        mask = _upright(mask, photos / frame.source_name)
-    if (mask.shape[1], mask.shape[0]) == stored:
-        return mask
-    if (mask.shape[1], mask.shape[0]) != source:
-        what = f"the mask is {size[0]}x{size[1]}, its image '{frame.source_name}' is {source[0]}x{source[1]}"
-        raise BadInput(what, remedy="A mask has the size of its image")
-    small = cv2.resize(mask.astype(np.float32), stored, interpolation=cv2.INTER_AREA)
-    return np.asarray(small >= 0.5)
-
-
-def _upright(mask: NDArray[np.bool_], photo: Path) -> NDArray[np.bool_]:
-    """Turn a mask that was drawn on a photo's pixels as they lie in the file (annotation tools ignore EXIF)."""
-    header = read_jpeg_header(photo.read_bytes()) if photo.is_file() else None
-    return mask if header is None else turn_upright(mask, header.orientation)
 
 
 def write_masks(

@@ -35,8 +35,20 @@ REMEDY = "Write the file again"
 ImageKey = int | str
 
 
+@dataclass(kw_only=True)
+class ImageTable:
+    """What a file says of images and categories."""
+
+    names: dict[ImageKey, list[str]] = field(default_factory=dict)
+    """File names of an image id; more than one where ids are not unique."""
+    sizes: dict[ImageKey, tuple[int, int] | None] = field(default_factory=dict)
+    """(width, height) of an image, upright or as its pixels lie in the file: what its polygons were drawn on. None
+    where sizes contradict each other; no entry where none is given."""
+    categories: dict[int, str] = field(default_factory=dict)
+
+
 @dataclass
-class Results:
+class Results(ImageTable):
     """What a file of results holds."""
 
     path: Path
@@ -51,9 +63,6 @@ class Results:
     """The instance's number among the `instances` of that element, or -1 where it is the element."""
     images: dict[ImageKey, int] = field(default_factory=dict)
     """Number of each image by its id or file name."""
-    names: dict[ImageKey, list[str]] = field(default_factory=dict)
-    """File names of an image id, from the table of images; more than one where ids are not unique."""
-    categories: dict[int, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.image_of)
@@ -80,7 +89,7 @@ def read_results(path: Path) -> Results:
     elements = read_elements(path, largest=LARGEST_ELEMENT, remedy=REMEDY, may_be_gzipped=False)
     for key, number, value, offset, length in elements:
         if key == "images":
-            _add_image(results.names, value, path, number)
+            _add_image(results, value, path, number)
         elif key == "categories":
             _add_category(results.categories, value)
         elif key in (None, "annotations", "instances"):
@@ -91,25 +100,24 @@ def read_results(path: Path) -> Results:
     return results
 
 
-def read_image_table(path: Path) -> tuple[dict[ImageKey, list[str]], dict[int, str]]:
-    """File names by image id, and names of categories: of a COCO dataset file, or of an object {id: file name}.
+def read_image_table(path: Path) -> ImageTable:
+    """The images and categories of a COCO dataset file, or of an object {id: file name}.
 
     Raises:
         BadInput: the file is absent, not JSON, or has no such table.
     """
-    names: dict[ImageKey, list[str]] = {}
-    categories: dict[int, str] = {}
+    table = ImageTable()
     for key, number, value, _, _ in read_elements(path, largest=LARGEST_ELEMENT, remedy=REMEDY):
         if key == "images" or key is None:
-            _add_image(names, value, path, number)
+            _add_image(table, value, path, number)
         elif key == "categories":
-            _add_category(categories, value)
+            _add_category(table.categories, value)
         elif isinstance(value, str):
-            names.setdefault(_as_id(key), []).append(value)
-    if not names:
+            table.names.setdefault(_as_id(key), []).append(value)
+    if not table.names:
         remedy = 'Expected a COCO dataset with `images`, or {"1": "a.jpg", ...}'
         raise BadInput("has no table of images", where=path, remedy=remedy)
-    return names, categories
+    return table
 
 
 def _add_element(results: Results, value: Any, number: int, offset: int, length: int) -> None:
@@ -154,12 +162,17 @@ def _what_is_wrong(value: Any) -> str | None:
     return None
 
 
-def _add_image(names: dict[ImageKey, list[str]], value: Any, path: Path, number: int) -> None:
+def _add_image(table: ImageTable, value: Any, path: Path, number: int) -> None:
     if not isinstance(value, dict) or not isinstance(value.get("file_name"), str):
         raise BadInput(f"image {number} has no id and file_name", where=path)
     if isinstance(value.get("id"), bool) or not isinstance(value.get("id"), (int, str)):
         raise BadInput(f"image {number} has no id that is a number or a text", where=path)
-    _add_name(names, _as_id(value["id"]), value["file_name"])
+    image = _as_id(value["id"])
+    _add_name(table.names, image, value["file_name"])
+    width, height = value.get("width"), value.get("height")
+    if type(width) is int and type(height) is int and min(width, height) > 0:
+        size = width, height
+        table.sizes[image] = size if table.sizes.get(image, size) == size else None
 
 
 def _add_name(names: dict[ImageKey, list[str]], image: ImageKey, name: str) -> None:

@@ -60,8 +60,11 @@ def test_what_killed_runs_left_is_cleared_and_what_they_replaced_comes_back(tmp_
 def test_damaged_json_is_named(tmp_path) -> None:
     path = tmp_path / "marker.json"
     path.write_text('{"a": ')
-    with pytest.raises(BadInput, match=r"marker\.json"):
+    with pytest.raises(BadInput, match=r"marker\.json.*Delete it and run again"):
         files.read_json(path)
+    with pytest.raises(BadInput) as caught:
+        files.read_json(path, remedy="Copy it again")
+    assert caught.value.remedy == "Copy it again"
 
 
 def test_quick_fingerprint_sees_content_but_not_the_time(tmp_path) -> None:

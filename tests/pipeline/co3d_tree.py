@@ -11,6 +11,7 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
+from pipeline.co3d.sources import Co3dSource
 from pipeline.geometry import Camera
 from tests.pipeline.synthetic import Scene, orbit
 
@@ -20,6 +21,7 @@ Intrinsics = Literal["ndc_norm_image_bounds", "ndc_isotropic"]
 UNIT = 3.7
 """Length of the scene's unit in CO3D's arbitrary unit: what is read must be scaled, not taken as it is."""
 SCALE_ADJUSTMENT = 0.25
+VIEWPOINT = {"R": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "T": [0, 0, 5], "focal_length": [2, 2], "principal_point": [0, 0]}
 
 
 @dataclass
@@ -50,6 +52,27 @@ class Tree:
             (self.folder / "set_lists").mkdir(exist_ok=True)
             (self.folder / "set_lists/set_lists_fewview_dev.json").write_text(json.dumps(self.sets))
         return self
+
+
+def row(sequence: str, number: int, **change: Any) -> dict[str, Any]:
+    """A frame's row without files on disk."""
+    image = {"path": f"apple/{sequence}/images/frame{number}.jpg", "size": [96, 128]}
+    return {"sequence_name": sequence, "frame_number": number, "image": image, "viewpoint": VIEWPOINT, **change}
+
+
+def tree_of(root: Path, frames: list[Any], sequences: list[Any] | None = None, **more: Any) -> Tree:
+    """A download that is annotations only."""
+    return Tree(root, frames=frames, sequences=sequences or [], **more).write()
+
+
+def named(name: str, **scores: Any) -> dict[str, Any]:
+    """A sequence's row."""
+    return {"sequence_name": name, "category": "apple", **scores}
+
+
+def numbers(source: Co3dSource, every: int = 1) -> list[int]:
+    """Of the frames that are wanted of a sequence."""
+    return [frame.number for frame in source.frames(every)]
 
 
 def write_jgz(path: Path, value: Any) -> Path:

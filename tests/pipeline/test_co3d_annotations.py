@@ -1,10 +1,12 @@
-"""CO3D's annotation files: streams, malformed and cut-off files, the index, set lists, paths that lead outside."""
+"""CO3D's annotation files: streams, malformed and cut-off files, the index, paths that lead outside."""
 
 from __future__ import annotations
 
+import json
+import os
+import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import pytest
 
@@ -14,27 +16,7 @@ from pipeline.co3d.annotations import parse_frame, parse_sequence
 from pipeline.co3d.index import open_index
 from pipeline.co3d.sources import Choice, co3d_id, find_co3d
 from pipeline.co3d.tree import Category, find_categories, is_inside
-from tests.pipeline.co3d_tree import Tree
-
-VIEWPOINT = {"R": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "T": [0, 0, 5], "focal_length": [2, 2], "principal_point": [0, 0]}
-
-
-def row(sequence: str, number: int, **change) -> dict:
-    """A frame's row without files on disk."""
-    image = {"path": f"apple/{sequence}/images/frame{number}.jpg", "size": [96, 128]}
-    return {"sequence_name": sequence, "frame_number": number, "image": image, "viewpoint": VIEWPOINT, **change}
-
-
-def tree_of(root: Path, frames: list, sequences: list | None = None, **more) -> Tree:
-    return Tree(root, frames=frames, sequences=sequences or [], **more).write()
-
-
-def named(name: str, **scores) -> dict:
-    return {"sequence_name": name, "category": "apple", **scores}
-
-
-def numbers(source, every: int = 1) -> list[int]:
-    return [frame.number for frame in source.frames(every)]
+from tests.pipeline.co3d_tree import VIEWPOINT, named, numbers, row, tree_of
 
 
 def test_rows_of_odd_content_keep_their_frame_with_the_problem():
@@ -46,6 +28,10 @@ def test_rows_of_odd_content_keep_their_frame_with_the_problem():
         ({"image": {"path": "a.jpg", "size": [True, 10]}}, "no image size"),
         ({"viewpoint": None}, "no viewpoint"),
         ({"viewpoint": {**VIEWPOINT, "T": [0, 0]}}, "viewpoint without a finite T"),
+        *(
+            ({"viewpoint": {**VIEWPOINT, "intrinsics_format": kind}}, "viewpoint with a malformed intrinsics_format")
+            for kind in ("\ud800", "", 7, ["ndc_isotropic"])
+        ),
     ):
         name, frame = parse_frame(row("a", 3, **change))
         assert (name, frame.number, frame.problem) == ("a", 3, problem)
@@ -94,6 +80,28 @@ def test_the_index_is_read_again_only_where_the_annotations_changed(tmp_path, mo
     changed.path.write_bytes(b"garbage")
     sources, failed, _ = find_co3d(tree.root, tmp_path / "work", Choice())
     assert not sources and "Delete it" in str(failed[0].reason)
+
+
+def test_any_byte_of_annotations_that_are_not_gzipped_makes_another_index(tmp_path):
+    tree = tree_of(tmp_path / "co3d", [row("a", i) for i in range(3)])
+    path = tree.folder / "frame_annotations.jgz"
+    filler = " " * (2 << 20)  # white space between rows: each of the three lies in no sample of a large file
+    texts = [filler.join(["[", *(json.dumps(r) + ("," if i < 2 else "") for i, r in enumerate(tree.frames)), "]"])]
+    texts.append(texts[0].replace('"frame_number": 0', '"frame_number": 9'))
+    path.write_text(texts[0])
+    first = open_index(tree.folder, tmp_path / "work")
+    assert open_index(tree.folder, tmp_path / "work").path == first.path
+    path.write_text(texts[1])
+    changed = open_index(tree.folder, tmp_path / "work")
+    assert changed.path != first.path and changed.sequences()[0].first_number == 1
+
+
+def test_text_that_cannot_be_written_costs_its_frame_only(tmp_path):
+    frames = [row("a", i) for i in range(9)]
+    frames[4] = row("a", 4, viewpoint={**VIEWPOINT, "intrinsics_format": "\ud800"})
+    tree = tree_of(tmp_path / "co3d", frames)
+    (source,), failed, _ = find_co3d(tree.root, tmp_path / "work", Choice())
+    assert not failed and [frame.number for frame in source.frames(1) if frame.problem] == [4]
 
 
 def test_the_parts_of_an_array_job_make_one_index_and_what_a_killed_one_left_goes(tmp_path, monkeypatch):
@@ -161,47 +169,6 @@ def test_sequences_are_left_out_by_score_and_one_without_a_score_too(tmp_path):
         assert all(r.status == "empty" for r in left_out)
 
 
-def test_set_lists_of_both_versions_choose_frames(tmp_path):
-    frames = [row("a", i) for i in range(6)] + [row("b", i) for i in range(6)]
-    sets = {"train": [["a", i, "x"] for i in (0, 2, 4)], "val": [["a", 5, "x"], ["b", 1, "x"], "odd", ["b"]]}
-    old = tree_of(tmp_path / "v1", frames, sets=sets)
-    new = tree_of(tmp_path / "v2", frames, sets=sets, version=2)
-    for tree, choice, expected in (
-        (old, Choice(sets=["train"]), {"a": [0, 2, 4]}),
-        (old, Choice(subsets=["train"]), {"a": [0, 2, 4]}),
-        (old, Choice(subsets=["train"], sets=["val"]), {"a": [0, 2, 4, 5], "b": [1]}),
-        (new, Choice(subsets=["fewview_dev"]), {"a": [0, 2, 4, 5], "b": [1]}),
-        (new, Choice(subsets=["fewview_dev"], sets=["val"]), {"a": [5], "b": [1]}),
-        (new, Choice(), {"a": list(range(6)), "b": list(range(6))}),
-    ):
-        sources, failed, _ = find_co3d(tree.root, tmp_path / "work", choice)
-        assert {source.annotation.name: numbers(source) for source in sources} == expected and not failed
-    for tree, choice, reason in (
-        (old, Choice(sets=["nope"]), "no set nope in its set lists (there are: train, val)"),
-        (new, Choice(subsets=["train"]), "no subset train (there are: fewview_dev)"),
-        (new, Choice(subsets=["fewview_dev"], sets=["nope"]), "no set nope"),
-    ):
-        sources, failed, _ = find_co3d(tree.root, tmp_path / "work", choice)
-        assert not sources and reason in str(failed[0].reason)
-    (old.folder / "set_lists.json").unlink()
-    assert "has no set lists" in str(find_co3d(old.root, tmp_path / "work", Choice(sets=["train"]))[1][0].reason)
-
-
-def test_categories_without_a_subset_are_left_out_unless_they_or_none_is_named(tmp_path):
-    sets = {"train": [["a", i, "x"] for i in range(3)]}
-    for name in ("apple", "banana"):
-        tree_of(tmp_path / "co3d", [row("a", i) for i in range(3)], sets=sets, version=2, category=name)
-    (tmp_path / "co3d/banana/set_lists/set_lists_fewview_dev.json").unlink()
-    for choice, n_sources, n_failed, n_left_out in (
-        (Choice(subsets=["fewview_dev"]), 1, 0, 1),
-        (Choice(subsets=["fewview_dev"], categories=["apple", "banana"]), 1, 1, 0),
-        (Choice(subsets=["fewview_de"]), 0, 2, 0),
-    ):
-        found = find_co3d(tmp_path / "co3d", tmp_path / "work", choice)
-        assert tuple(map(len, found)) == (n_sources, n_failed, n_left_out), choice
-        assert all("no subset fewview_de" in str(r.reason) for rows in found[1:] for r in rows)
-
-
 def test_names_that_are_not_there_are_rows_and_a_folder_that_is_no_download_is_wrong_usage(tmp_path):
     tree = tree_of(tmp_path / "co3d", [row(f"s{i}", 1) for i in range(12)])
     choice = Choice(categories=["apple", "pear", "../co3d"], sequences=["s2", "apple_s10", "s99"])
@@ -219,6 +186,23 @@ def test_names_that_are_not_there_are_rows_and_a_folder_that_is_no_download_is_w
         find_categories(tree.folder, [])
     with pytest.raises(UsageError, match="holds no <category>/frame_annotations"):
         find_categories(tmp_path / "work", [])
+
+
+def test_a_category_whose_name_is_not_utf8_is_a_row_and_the_others_go_on(tmp_path):
+    tree = tree_of(tmp_path / "co3d", [row("a", 1)])
+    strange = tree.root / os.fsdecode(b"\xff")
+    try:
+        strange.mkdir()
+    except OSError:
+        pytest.skip("this file system takes UTF-8 names only")
+    shutil.copy(tree.folder / "frame_annotations.jgz", strange)
+    for categories in ([], ["apple", strange.name]):
+        sources, (failed,), _ = find_co3d(tree.root, tmp_path / "work", Choice(categories=categories))
+        assert [source.id for source in sources] == ["apple_a"] and "its name is not UTF-8. Rename it" in failed.reason
+        assert "udcff" in failed.sequence and f"{failed.sequence} {failed.reason}".encode()
+    tree.root.rename(tmp_path / os.fsdecode(b"co3d\xff"))
+    with pytest.raises(UsageError, match="its name is not UTF-8"):
+        find_categories(tmp_path / os.fsdecode(b"co3d\xff"), [])
 
 
 def test_strange_names_get_ids_that_are_safe_and_do_not_depend_on_what_else_is_chosen(tmp_path):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 import shutil
 import sqlite3
 from contextlib import closing
@@ -13,13 +11,24 @@ from typing import Any
 
 import numpy as np
 import pytest
+from camera_files import (
+    CAMERAS,
+    NAMES,
+    NERFSTUDIO_WORLD,
+    SHIFTED_WORLD,
+    named,
+    write_cameras_json,
+    write_colmap_binary,
+    write_colmap_text,
+    write_transforms,
+)
 from synthetic import Scene, orbit, write_sequence
 
 from dope.common.errors import BadInput
 from pipeline.cameras import colmap
 from pipeline.cameras.colmap.base import pycolmap
 from pipeline.cameras.compare import compare_cameras
-from pipeline.cameras.known import KnownCameras, place_cameras, read_known_cameras, reuse_cameras
+from pipeline.cameras.known import KnownCameras, place_cameras, reuse_cameras
 from pipeline.cameras.known_points import posed_pairs
 from pipeline.cameras.naming import match_names
 from pipeline.cameras.project import write_project
@@ -28,8 +37,6 @@ from pipeline.geometry import Camera, rotation_angle_deg
 from pipeline.sequence import Frame, Sequence
 
 CAPTURES = Path(__file__).parents[2].parent / "shared/data/captures"
-CAMERAS = orbit(9, arc_deg=72, distortion=(0.05, -0.02, 0.001, -0.0005))
-NAMES = [f"{i:04d}.jpg" for i in range(len(CAMERAS))]
 NO_POINTS = SfmConfig(known_points="none")
 CONFIG = SfmConfig(max_image_size=320, max_features=800)
 
@@ -57,82 +64,6 @@ def sequence(filmed, tmp_path) -> Sequence:
 
 def known(cameras: dict[str, Camera], **more: Any) -> KnownCameras:
     return KnownCameras(cameras, more.get("xyz"), more.get("rgb"), "the test")
-
-
-def named(cameras: list[Camera] = CAMERAS) -> dict[str, Camera]:
-    return dict(zip(NAMES, cameras, strict=True))
-
-
-# --- files as other tools write them ---------------------------------------------------------------------------------
-
-
-def quaternion(R: np.ndarray) -> list[float]:
-    """w, x, y, z of a rotation by less than 180 degrees."""
-    w = math.sqrt(max(0.0, 1 + np.trace(R))) / 2
-    return [w, *((R[[2, 0, 1], [1, 2, 0]] - R[[1, 2, 0], [2, 0, 1]]) / (4 * w))]
-
-
-def write_colmap_text(folder: Path, cameras: dict[str, Camera], model: str = "OPENCV") -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
-    lenses, images = ["# a comment"], ["# another"]
-    for number, (name, camera) in enumerate(cameras.items(), start=1):
-        K, d = camera.K, camera.distortion
-        parameters = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *d][: 8 if model.startswith("OPENCV") else 4]
-        size = f"{camera.width} {camera.height}"
-        lenses.append(f"{number} {model} {size} {' '.join(repr(float(p)) for p in parameters)}")
-        pose = " ".join(repr(float(v)) for v in (*quaternion(camera.R), *camera.t))
-        images += [f"{number} {pose} {number} {name}", ""]
-    (folder / "cameras.txt").write_text("\n".join(lenses) + "\n")
-    (folder / "images.txt").write_text("\n".join(images) + "\n")
-    (folder / "points3D.txt").write_text("")
-    return folder
-
-
-def write_colmap_binary(folder: Path, cameras: dict[str, Camera]) -> Path:
-    text = write_colmap_text(folder.with_name("text"), cameras)
-    folder.mkdir()
-    pycolmap.Reconstruction(text).write_binary(folder)
-    return folder
-
-
-def transforms(cameras: dict[str, Camera], world: np.ndarray | None = None, **more: Any) -> dict[str, Any]:
-    """nerfstudio's values; `world` (3, 4) turns and shifts the world as `ns-process-data` does."""
-    frames = []
-    for name, camera in cameras.items():
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = camera.R.T @ np.diag([1, -1, -1]), camera.centre
-        if world is not None:
-            pose[:3, :] = world[:, :3] @ pose[:3, :] + np.pad(world[:, 3:], ((0, 0), (3, 0)))
-        frames.append({"file_path": f"images/{name}", "transform_matrix": pose.tolist()})
-    first = next(iter(cameras.values()))
-    values = {"camera_model": "OPENCV", "w": first.width, "h": first.height, "fl_x": first.K[0, 0]}
-    values |= {"fl_y": first.K[1, 1], "cx": first.K[0, 2], "cy": first.K[1, 2]}
-    values |= dict(zip(("k1", "k2", "p1", "p2"), first.distortion.tolist(), strict=True))
-    if world is not None:
-        values["applied_transform"] = world.tolist()
-    return {**values, **more, "frames": frames}
-
-
-def write_transforms(folder: Path, cameras: dict[str, Camera], **more: Any) -> Path:
-    folder.mkdir(exist_ok=True)
-    (folder / "transforms.json").write_text(json.dumps(transforms(cameras, **more)))
-    return folder
-
-
-def write_cameras_json(folder: Path, cameras: dict[str, Camera]) -> Path:
-    rows = []
-    for name, camera in cameras.items():
-        K = camera.K
-        row = {"name": Path(name).stem, "width": camera.width, "height": camera.height, "fx": K[0, 0], "fy": K[1, 1]}
-        row |= {"cx": K[0, 2], "cy": K[1, 2], "dist": camera.distortion.tolist()}
-        rows.append(row | {"w2c_R": camera.R.tolist(), "w2c_t": camera.t.tolist()})
-    path = folder / "cameras.json"
-    path.write_text(json.dumps({"frames": rows}))
-    return path
-
-
-NERFSTUDIO_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
-SHIFTED_WORLD = np.concatenate([orbit(3)[1].R, [[0.3], [-2.0], [7.0]]], axis=1)
 
 
 @pytest.mark.parametrize("kind", ["text", "binary", "transforms", "applied", "shifted", "cameras.json"])
@@ -359,112 +290,6 @@ def test_views_are_matched_with_their_neighbours_on_the_orbit():
     order = np.random.default_rng(0).permutation(24)
     shuffled = posed_pairs([cameras[i] for i in order], (1, 2))
     assert expected <= {tuple(sorted((int(order[a]), int(order[b])))) for a, b in shuffled}
-
-
-# --- damaged files ----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin", "frames.bin", "rigs.bin"])
-@pytest.mark.parametrize("cut", [0.0, 0.5, 0.95, 1.05])
-def test_a_truncated_model_is_said_to_be_damaged(tmp_path, name, cut):
-    folder = write_colmap_binary(tmp_path / "model", named())
-    data = (folder / name).read_bytes()
-    (folder / name).write_bytes((data + bytes(100))[: int(cut * len(data) + (cut > 1))])
-    with pytest.raises(BadInput, match=r"model that cannot be read \(.* is damaged or cut off"):
-        read_known_cameras(folder)
-
-
-def test_models_that_cannot_be_used_say_what_to_do(tmp_path):
-    with pytest.raises(BadInput, match=r"holds no cameras.*sparse/0"):
-        read_known_cameras(tmp_path)
-    fisheye = write_colmap_text(tmp_path / "fisheye", named(), model="OPENCV_FISHEYE")
-    with pytest.raises(BadInput, match=r"OPENCV_FISHEYE.*image_undistorter"):
-        read_known_cameras(fisheye)
-    (fisheye / "images.txt").write_text("")
-    with pytest.raises(BadInput):
-        read_known_cameras(fisheye)
-    (fisheye / "points3D.txt").unlink()
-    with pytest.raises(BadInput, match="cannot be read"):
-        read_known_cameras(fisheye)
-
-
-def test_a_model_without_rigs_as_older_colmaps_write_it(tmp_path):
-    folder = write_colmap_binary(tmp_path / "model", named())
-    (folder / "rigs.bin").unlink()
-    (folder / "frames.bin").unlink()
-    assert len(read_known_cameras(folder).cameras) == 9
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (lambda v: v.pop("fl_x"), "frame 0 .*lacks 'fl_x'"),
-        (lambda v: v["frames"][4].pop("transform_matrix"), "frame 4 .*lacks 'transform_matrix'"),
-        (lambda v: v["frames"][4].pop("file_path"), "frame 4 .*lacks 'file_path'"),
-        (lambda v: v["frames"][4].update(file_path="images/0003.jpg"), "'images/0003.jpg' is there twice"),
-        (lambda v: v["frames"][2].update(transform_matrix=[[1, 2], [3, 4]]), "frame 2 .*shape"),
-        (lambda v: v["frames"][2].update(transform_matrix=np.zeros((4, 4)).tolist()), "no rotation"),
-        (lambda v: v["frames"][2].update(transform_matrix=[["x"] * 4] * 4), "frame 2 .*not a camera"),
-        (
-            lambda v: v["frames"][2]["transform_matrix"][0].__setitem__(3, float("nan")),
-            "frame 2 .*0002.jpg.*not finite",
-        ),
-        (lambda v: v.update(camera_model="OPENCV_FISHEYE"), "OPENCV_FISHEYE.*Undistort"),
-        (lambda v: v.update(k3=0.1), "k3.*Undistort"),
-        (lambda v: v.update(w=float("inf")), "frame 0 .*not a camera"),
-        (lambda v: v.update(fl_x=float("nan")), "not finite"),
-        (lambda v: v.update(cx=None), "frame 0 .*not a camera"),
-        (lambda v: v.update(applied_transform=[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0]]), "mirrors"),
-        (lambda v: v.update(applied_transform="x"), "applied_transform"),
-        (lambda v: v.update(applied_transform=1e308), "applied_transform"),
-        (lambda v: v.update(applied_transform=[[10**400] * 4] * 3), "applied_transform"),
-        (lambda v: (v.pop("w"), [row.update(file_path="x" * 5000) for row in v["frames"]]), "none of its images"),
-        (lambda v: (v.pop("w"), [row.update(file_path="/") for row in v["frames"]]), "none of its images"),
-        (lambda v: v.update(frames=[]), "no camera with a pose"),
-        (lambda v: v.update(frames={"a": 1}), "no list of `frames`"),
-        (lambda v: (v.pop("w"), v.pop("h")), "no image size"),
-    ],
-)
-def test_a_damaged_transforms_file_is_refused_with_the_frame(tmp_path, change, said):
-    values = transforms(named())
-    change(values)
-    (tmp_path / "transforms.json").write_text(json.dumps(values))
-    with pytest.raises(BadInput, match=said):
-        read_known_cameras(tmp_path)
-
-
-def test_intrinsics_may_stand_in_each_frame_and_be_angles(tmp_path):
-    values = transforms(named())
-    for key in ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"):
-        values.pop(key)
-    values["camera_angle_x"] = 2 * math.atan(320 / 2 / 380)
-    values["frames"][1] |= {"fl_x": 400, "fl_y": 410, "cx": 150, "k1": 0.5}
-    (tmp_path / "transforms.json").write_text(json.dumps(values))
-    cameras = list(read_known_cameras(tmp_path).cameras.values())
-    np.testing.assert_allclose(cameras[0].K, [[380, 0, 160], [0, 380, 120], [0, 0, 1]])
-    np.testing.assert_allclose(cameras[1].K, [[400, 0, 150], [0, 410, 120], [0, 0, 1]])
-    assert cameras[1].distortion.tolist() == [0.5, 0, 0, 0]
-
-
-def test_one_digit_of_a_large_camera_file_is_another_input(tmp_path):
-    from pipeline.inputs.sources import place_fingerprint
-
-    path = write_transforms(tmp_path, named(), note="1" * 1_000_000) / "transforms.json"
-    before = place_fingerprint(tmp_path, whole=True), place_fingerprint(path)
-    data = bytearray(path.read_bytes())
-    data[len(data) // 4] = ord("2")
-    path.write_bytes(data)
-    after = place_fingerprint(tmp_path, whole=True), place_fingerprint(path)
-    assert before[0] != after[0] and before[1] != after[1]
-
-
-def test_sizes_that_are_not_given_are_those_of_the_images(tmp_path, filmed):
-    values = transforms({name.removesuffix(".jpg"): camera for name, camera in named().items()})
-    values.pop("w"), values.pop("h")
-    (tmp_path / "images").mkdir()
-    shutil.copy(filmed.images / "000000.jpg", tmp_path / "images/0003.jpg")
-    (tmp_path / "transforms.json").write_text(json.dumps(values))
-    assert {(c.width, c.height) for c in read_known_cameras(tmp_path).cameras.values()} == {(320, 240)}
 
 
 # --- the sequence as a COLMAP project ---------------------------------------------------------------------------------

@@ -175,6 +175,18 @@ def test_masks_of_a_video_go_by_frame_number(tmp_path: Path, name: str) -> None:
         assert mask is not None and mask[0].sum() == 4 * int(row.source_name) + 4
 
 
+def test_two_masks_of_one_video_frame_are_refused(tmp_path: Path) -> None:
+    video = write_video(tmp_path / "a.mp4", pan(20, WIDTH, HEIGHT))
+    sequence = Sequence(tmp_path / "out/a")
+    extract_frames(Source(video, "a", "video"), sequence, FramesConfig(every=3))
+    folder = put(tmp_path / "m", [disc().astype(np.uint8) * 255] * 20, "frame_{:06d}_obj_0.png")
+    with pytest.raises(BadInput) as caught:
+        import_masks(sequence, folder, MasksConfig())
+    for part in (str(folder), "frame_000000_obj_0.png and frame_000001_obj_0.png are both masks of frame 0"):
+        assert part in str(caught.value)
+    assert not sequence.masks.exists()
+
+
 def test_taking_frames_again_without_masks_leaves_no_old_ones(tmp_path: Path) -> None:
     sequence = photos(tmp_path)
     import_masks(sequence, put(tmp_path / "m", [disc().astype(np.uint8) * 255] * N), MasksConfig())

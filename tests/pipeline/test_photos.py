@@ -12,7 +12,7 @@ from dope.common.errors import BadInput
 from pipeline.inputs.frame_quality import QualityConfig, difference, look_at, neighbours_are_alike
 from pipeline.inputs.frames import FramesConfig, extract_frames
 from pipeline.inputs.photos import list_photos, read_jpeg_header, read_photo, turn_upright
-from pipeline.inputs.sources import Source, find_sources
+from pipeline.inputs.sources import Source, find_sources, source_fingerprint
 from pipeline.sequence import Sequence
 
 
@@ -116,6 +116,22 @@ def test_damaged_photos_are_rows_with_reasons(tmp_path: Path) -> None:
         "cut off" in dropped[cut.name] and "cut off" in dropped["IMG_9999.png"] and "not an image" in dropped[text.name]
     )
     assert details["kept"] == 7 and sum(details["dropped"].values()) == 4
+
+
+def test_photos_of_kinds_that_cannot_be_read_are_told(tmp_path: Path) -> None:
+    folder = write_photos(tmp_path / "a", pan(8))
+    before = source_fingerprint(Source(folder, "a", "photos"))
+    for name in ("x1.HEIC", "x2.heic", "raw.dng", "IMG_0003.CR2", ".hidden.heic"):
+        (folder / name).write_bytes(b"data")
+    details, sequence = extract(folder, tmp_path / "out")
+    assert len(sequence.read_frames()) == details["kept"] == 8
+    (warning,) = details["warnings"]  # IMG_0003 is there as a JPEG, too
+    assert warning.startswith("1 DNG, 2 HEIC files were left out (raw.dng ...)") and "convert them to JPEG" in warning
+    assert source_fingerprint(Source(folder, "a", "photos")) != before
+    for path in list(folder.glob("*.jpg"))[:5]:
+        path.unlink()
+    with pytest.raises(BadInput, match=r"3 of 3 frames are usable.*HEIC files were left out.*convert them to JPEG"):
+        extract(folder, tmp_path / "out")
 
 
 def test_one_size_is_kept(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from synthetic import orbit
 from tiny_media import encode, pan, write_photos
 from typer.testing import CliRunner
 
@@ -27,6 +29,8 @@ from pipeline.tasks import RunOptions
 
 HERE, AGAIN = RunOptions(), RunOptions(overwrite=True)
 MORE = ColmapConfig(sfm=SfmConfig(max_features=3000))
+
+pytestmark = pytest.mark.filterwarnings("ignore:__array__:DeprecationWarning")  # of pycocotools under NumPy 2
 
 
 @pytest.fixture(autouse=True)
@@ -129,6 +133,37 @@ def test_cameras_and_depth_do_not_depend_on_masks_made_later(photos: Path, tmp_p
     assert mask is not None and mask[0].sum() == 60
 
 
+def test_instances_that_came_with_the_input_are_picked_alike_whatever_cameras_there_are(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Away from the middle of the image the object is seen by the cameras only, which are not there at first."""
+    squares = [(48, 80), (100, 8)]  # top, left: near the middle, and where the cameras say that the object is
+    corners = [[x, y, x + 24, y, x + 24, y + 24, x, y + 24] for y, x in squares]
+    value = [{"image_id": path.name, "segmentation": [c]} for path in photos.iterdir() for c in corners]
+    (tmp_path / "r.json").write_text(json.dumps(value))
+    fox = Sequence(tmp_path / "w/fox")
+
+    def reconstruct(sequence: Sequence, *_: object) -> dict[str, Any]:
+        frames = sequence.read_frames()
+        for frame, camera in zip(frames, orbit(len(frames), width=192, height=128, wobble=0.0), strict=True):
+            frame.set_camera(replace(camera, K=camera.K + np.array([[0, 0, -75.0], [0, 0, 48.0], [0, 0, 0]])))
+        sequence.write_frames(frames)
+        return {}
+
+    monkeypatch.setattr(prepare, "reconstruct", reconstruct)
+    colmap(photos, tmp_path / "w", tmp_path / "r.json")
+    before = fox.read_mask(fox.read_frames()[0])
+    assert before is not None and before[60, 92] and not before[110, 20]
+    add_masks([fox], MasksConfig(), {"fox": masks_for(photos, tmp_path / "later")}, HERE)
+    for pick in ("consistent", "centre"):
+        config = replace(MORE, masks=MasksConfig(pick=pick))  # type: ignore[arg-type]
+        prepare.restore_input_masks(fox, tmp_path / "r.json", config.masks)
+        np.testing.assert_array_equal(fox.read_mask(fox.read_frames()[0]), before)
+        add_masks([fox], config.masks, {"fox": tmp_path / "r.json"}, AGAIN)  # these may look at the cameras
+        after = fox.read_mask(fox.read_frames()[0])
+        assert after is not None and after[110, 20], "else this test would show nothing"
+
+
 def test_given_masks_are_kept_until_others_take_their_place(photos: Path, tmp_path: Path) -> None:
     fox = Sequence(tmp_path / "w/fox")
     colmap(photos, tmp_path / "w", masks_for(photos, tmp_path / "given"))
@@ -222,6 +257,26 @@ def test_an_input_that_cannot_be_read_does_not_stop_the_others(
     rows = prepare.prepare(sources, tmp_path / "w", ColmapConfig(), HERE)
     assert states(rows) == ["frames failed", "frames ok", "sfm ok", "depth ok"]
     assert str(bad) in str(rows[0].reason)
+
+
+def test_masks_that_cannot_be_read_do_not_stop_the_others(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("a", "b"):
+        prepare.prepare([Source(photos, name, "photos")], tmp_path / "w", ColmapConfig(), HERE)
+    masks = {name: masks_for(photos, tmp_path / "masks" / name) for name in ("a", "b")}
+    closed, whole = masks["a"] / "IMG_0002.png", Path.open
+
+    def opened(path: Path, *args: Any, **more: Any) -> Any:
+        if path == closed:
+            raise PermissionError(13, "Permission denied", str(path))
+        return whole(path, *args, **more)
+
+    monkeypatch.setattr(Path, "open", opened)
+    sequences = [Sequence(tmp_path / "w" / name) for name in masks]
+    rows = add_masks(sequences, MasksConfig(), masks, HERE)
+    assert states(rows) == ["masks failed", "masks ok"]
+    assert str(closed) in str(rows[0].reason) and "Permission denied" in str(rows[0].reason)
 
 
 def test_a_work_folder_that_cannot_be_made_is_named(photos: Path, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from tiny_media import encode, pan, texture, write_photos
 
+from pipeline.inputs.photos import list_photos
 from pipeline.inputs.sources import find_sources, input_errors_as_rows, known_sources, source_fingerprint
 from pipeline.sequence import Sequence, SequenceInfo
 
@@ -109,6 +110,55 @@ def test_a_link_to_a_folder_above_ends(tmp_path: Path) -> None:
     touch(tmp_path / "a/1.mp4")
     (tmp_path / "a/loop").symlink_to(tmp_path)
     assert ids(tmp_path) == ["1"]
+
+
+def test_a_photo_beside_captures_does_not_hide_them(tmp_path: Path) -> None:
+    captures = tmp_path / "captures"
+    for name in ("a", "b/images"):
+        photo_folder(captures / name)
+    touch(captures / "cover.jpg", PHOTO)
+    for name in ("masks", "depths"):
+        photo_folder(captures / name)
+    assert ids(captures) == ["captures", "a", "b"]
+
+
+def test_given_masks_and_depths_beside_the_photos_are_no_captures(tmp_path: Path) -> None:
+    fox = photo_folder(tmp_path / "in/fox")
+    soft, z = photo_folder(fox / "soft_masks"), photo_folder(fox / "z")
+    for place in (fox, fox.parent):
+        for masks, depths in ((str(soft), str(z)), ("{}/soft_masks", "{}/z")):
+            (source,), errors = find_sources([place], masks=masks, depths=depths)
+            assert not errors and (source.id, source.masks, source.depths) == ("fox", soft, z)
+    (source,), _ = find_sources([fox], depths=str(z), masks_later=str(soft))
+    assert source.id == "fox"
+    photo_folder(tmp_path / "data/captures/cat")
+    (source,), _ = find_sources([tmp_path / "data"], masks=str(tmp_path / "data/captures"))
+    assert source.id == "cat", "a folder with masks for each sequence may hold the sequences, too"
+    clip = touch(tmp_path / "films/clip.mp4")
+    photo_folder(tmp_path / "films/clip_masks")
+    (source,), errors = find_sources([clip.parent], masks="{}_masks")
+    assert not errors and source.path == clip
+
+
+def test_a_folder_that_cannot_be_used_does_not_hide_its_neighbours(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("in/a", "in/closed", "in/co3d", "in/z"):
+        photo_folder(tmp_path / name)
+    touch(tmp_path / "in/co3d/frame_annotations.jgz")
+    touch(tmp_path / "in/phone/1.heic")
+
+    def listed(folder: Path) -> list[Path]:
+        if folder.name == "closed":
+            raise PermissionError(13, "Permission denied", str(folder))
+        return list_photos(folder)
+
+    monkeypatch.setattr("pipeline.inputs.sources.list_photos", listed)
+    sources, errors = find_sources([tmp_path / "in"])
+    assert [source.id for source in sources] == ["a", "z"]
+    assert [(name, path) for name, path, _ in errors] == [(n, tmp_path / "in" / n) for n in ("closed", "co3d", "phone")]
+    for (_, _, error), part in zip(errors, ("Permission denied", "dope prep co3d", "Convert .heic"), strict=True):
+        assert part in str(error)
 
 
 def test_masks_are_found_for_one_and_for_many(tmp_path: Path) -> None:
