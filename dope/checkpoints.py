@@ -168,7 +168,7 @@ def read_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str,
     if values["format"] != FORMAT:
         version = values.get("versions", {}).get("dope", "unknown")
         raise UsageError(
-            f"was written by dope {version} in format {values['format']}; dope {dope.__version__} reads format {FORMAT}",
+            f"was written by dope {version} in format {values['format']}; this one reads format {FORMAT}",
             where=path,
             remedy="Use that version of dope for this run, or train anew into another --out",
         )
@@ -204,7 +204,9 @@ def resume(path: Path, state: TrainState, config: TrainConfig, dataset: str) -> 
     state.validation, state.untrained = values["validation"], values["untrained"]
 
 
-def resume_newest(run: Path, state: TrainState, config: TrainConfig, dataset: str) -> tuple[Path | None, list[BadInput]]:
+def resume_newest(
+    run: Path, state: TrainState, config: TrainConfig, dataset: str
+) -> tuple[Path | None, list[BadInput]]:
     """Put `state` where the newest checkpoint of a run that can be read was; damaged ones are passed over.
 
     Returns:
@@ -227,6 +229,34 @@ def resume_newest(run: Path, state: TrainState, config: TrainConfig, dataset: st
             return path, damaged
     what = f"{damaged[0].what}; no older one can be read either"
     raise BadInput(what, where=newest, remedy="Copy the run again, or train anew into another --out")
+
+
+def go_on_from(
+    how: str | Path, out: Path, state: TrainState, config: TrainConfig, dataset: str
+) -> tuple[Path | None, list[BadInput]]:
+    """Put `state` where the `how` of `dope train --resume` says: auto, never, or a checkpoint or run.
+
+    Returns:
+        The checkpoint, or None where the run begins; and what was wrong with newer ones.
+
+    Raises:
+        BadInput: no such checkpoint, or it (with `auto`, every one of the run) is damaged.
+        UsageError: as `resume`; or `never`, and `out` holds a run.
+    """
+    if how == "auto":
+        return resume_newest(out, state, config, dataset)
+    if how == "never":
+        newest = latest_checkpoint(out)
+        if newest is not None:
+            raise UsageError(
+                f"already holds a run ({newest.name})",
+                where=out,
+                remedy="Give another --out, delete this folder, or go on with --resume auto",
+            )
+        return None, []
+    found = find_checkpoint(Path(how))
+    resume(found, state, config, dataset)
+    return found, []
 
 
 def load_network(path: Path, device: torch.device | str = "cpu") -> tuple[DopeNetwork, dict[str, Any]]:

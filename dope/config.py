@@ -10,8 +10,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+import yaml as pyyaml
+
 from dope.augmentation import AugmentationConfig
-from dope.common import settings
+from dope.common import files, settings
 from dope.common.errors import UsageError
 from dope.networks import NetworkConfig
 from dope.preset_files import merged, preset_values
@@ -183,6 +185,12 @@ def load_config(preset: str | None = None, yaml: Path | None = None, overrides: 
     return config
 
 
+def write_config(path: Path, config: TrainConfig) -> None:
+    """Write the resolved settings as YAML, which `--config` reads again, with its hash in the first line."""
+    text = pyyaml.safe_dump(_plain(settings.to_dict(config)), sort_keys=False, allow_unicode=True)
+    files.write_bytes(path, f"# hash {settings.config_hash(config)}\n{text}".encode())
+
+
 def check(config: TrainConfig) -> None:
     """Raise `UsageError` naming the first setting whose value makes no sense."""
     data, schedule, network, augmentation = config.data, config.schedule, config.network, config.augmentation
@@ -238,6 +246,12 @@ def differing_keys(ours: dict[str, Any], theirs: dict[str, Any]) -> dict[str, tu
         for key in sorted(left.keys() | right.keys())
         if left.get(key) != right.get(key) and not any(key == n or key.startswith(n + ".") for n in RESULT_NEUTRAL)
     }
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(inner) for key, inner in value.items()}
+    return [_plain(inner) for inner in value] if isinstance(value, (list, tuple)) else value
 
 
 def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -96,7 +96,7 @@ def test_one_rank_asked_to_stop_stops_all(outcomes: dict[tuple[str, int], dict])
 def test_two_ranks_train_and_one_goes_on(shards: Path, tmp_path: Path) -> None:
     settings = [
         *two_ranks.SETTINGS, "data.batch_size=4", "data.pairs_per_object=1", "data.workers=1", "schedule.epochs=3",
-        "validation.every=1", "checkpoint.every=1", "log_every=1",
+        "validation.every=1", "checkpoint.every=1", "log.every=1",
     ]  # fmt: skip
     arguments = [argument for value in settings for argument in ("--set", value)]
     done = torchrun(

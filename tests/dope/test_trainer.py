@@ -31,7 +31,7 @@ ALONE = Ranks(0, 1, torch.device("cpu"))
 TINY = [
     "network.width=0.125", "network.pyramid=16", "network.projector=[16, 8]", "data.image_size=32", "data.points=8",
     "data.batch_size=4", "data.pairs_per_object=1", "data.workers=0", "schedule.epochs=3", "validation.every=1",
-    "checkpoint.every=0", "log_every=1", "device=cpu",
+    "checkpoint.every=0", "log.every=1", "device=cpu",
 ]  # fmt: skip
 
 
@@ -336,7 +336,7 @@ def test_it_learns(tmp_path: Path) -> None:
     settings = [
         "network.width=0.25", "network.pyramid=32", "network.projector=[64, 32]", "data.image_size=64",
         "data.points=16", "data.batch_size=16", "data.workers=0", "schedule.epochs=15", "validation.every=0",
-        "checkpoint.every=0", "log_every=1", "optimiser.lr=3e-3", "device=cpu", "validation.every=100",
+        "checkpoint.every=0", "log.every=1", "optimiser.lr=3e-3", "device=cpu", "validation.every=100",
         "augmentation.colour_p=0.2", "augmentation.geometry=false",
     ]  # fmt: skip
     result = train(shards, tmp_path / "run", load_config("nano", None, settings))
