@@ -63,7 +63,10 @@ def save_checkpoint(
     }
     with files.atomic_path(path) as partial:
         with partial.open("wb") as file:  # given a path, torch's own writer hides that the disk is full
-            torch.save(values, file)
+            try:
+                torch.save(values, file)
+            except RuntimeError as error:  # here as well: it fails once more when it closes what it could not write
+                raise error.__context__ if isinstance(error.__context__, OSError) else error from None
         digest = files.sha256_of(partial)
         # of a checkpoint that this one replaces: after a crash before the next line it would belie a whole file
         _hash_path(path).unlink(missing_ok=True)
@@ -106,9 +109,13 @@ def pointed_to(run: Path, pointer: str) -> Path | None:
     return path if path and path.is_file() else None
 
 
-def best_pck(run: Path) -> float:
-    """The PCK of the best checkpoint; minus infinity where there is none."""
-    if pointed_to(run, BEST) is None:
+def best_pck(run: Path, *, before: int) -> float:
+    """The PCK of the best checkpoint; minus infinity where there is none from before step `before`.
+
+    A run that goes on from an earlier checkpoint comes by its later ones again.
+    """
+    path = pointed_to(run, BEST)
+    if path is None or _step_of(path) >= before:
         return float("-inf")
     try:
         return float((run / "checkpoints" / BEST).read_text().split()[1])

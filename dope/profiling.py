@@ -52,6 +52,8 @@ class StepProfiler:
         if self._profile:
             self._profile.stop()
             self._profile = None
+            if not self._path.exists() and self._ranks.is_first:
+                self._say(f"the run ended within the {WARM_UP} steps that --profile leaves out: no trace was written")
 
     def step(self) -> None:
         """Note the end of a training step."""

@@ -128,7 +128,8 @@ class Run:
         log: RunLog | SilentLog = SilentLog()
         if self.ranks.is_first:
             write_config(self.out / "config.yaml", config)
-            files.clear_leftovers(self.out / "checkpoints")
+            for folder in (self.out, self.out / "checkpoints"):
+                files.clear_leftovers(folder)
             plain = settings.to_dict(config)
             log = RunLog(self.out, start=step, total=self.total_steps, wandb=config.log.wandb, config=plain)
         facts = self.facts()
@@ -200,7 +201,7 @@ class Run:
                 sheet = held_out_sheet(network, self.held_out, self.config.log.pictures, title=title, device=device)
             if sheet is not None:
                 log.picture("validation/pairs", step, sheet)
-        return result["pck"] > checkpoints.best_pck(self.out)
+        return result["pck"] > checkpoints.best_pck(self.out, before=step)
 
     def save(self, log: RunLog | SilentLog, *, is_best: bool = False) -> None:
         """Write a checkpoint on the first rank."""
