@@ -1,8 +1,10 @@
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import poisoned_rank
 import pytest
 import torch
 import two_ranks
@@ -118,6 +120,19 @@ def test_two_ranks_train_and_one_goes_on(shards: Path, tmp_path: Path) -> None:
     assert result["status"] == "finished" and result["steps_of_this_call"] == 3
     assert [line["step"] for line in read_metrics(tmp_path, "step")] == [1, 2, 3, 4, 5, 6]
     assert load_network(tmp_path)[1]["step"] == 6
+
+
+@pytest.mark.parametrize("what", ["loss", "gradient"])
+def test_all_ranks_stop_together_where_one_is_not_finite(shards: Path, tmp_path: Path, what: str) -> None:
+    done = torchrun(str(Path(poisoned_rank.__file__)), what, str(shards), str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    said, kept = zip(*((tmp_path / f"said-{rank}.txt").read_text().splitlines() for rank in (0, 1)), strict=True)
+    assert said[0] == said[1] and f"the {'norm of the ' * (what == 'gradient')}{what} is nan at step 2" in said[0]
+    assert kept[0] == kept[1] and kept[0].startswith("True "), "the weights are those before the step, on both"
+    written = json.loads((tmp_path / "not_finite-2.json").read_text())
+    assert [sample["rank"] for sample in written["samples"]] == [0, 0, 1, 1]
+    assert len({sample["key"] for sample in written["samples"]}) == 4
+    assert all(sample["key"] in said[0] for sample in written["samples"])
 
 
 def test_devices() -> None:
