@@ -29,7 +29,7 @@ def gradient_norm(parameters: Iterable[nn.Parameter]) -> float:
 
 
 def require_finite(run: Run, report: Mapping[str, float], batch: PairBatch, log: RunLog | SilentLog) -> None:
-    """Check the `loss` and, where it is there, the `grad_norm` of a step's report before the optimiser uses them.
+    """Check `loss` and `grad_norm` of a step's report before the optimiser uses the gradients.
 
     Both are the same on all ranks, so all stop together. RUN/not_finite-<step>.json gets the values (as text where JSON
     has no such number) and the samples of all ranks.
@@ -37,7 +37,7 @@ def require_finite(run: Run, report: Mapping[str, float], batch: PairBatch, log:
     Raises:
         DopeError: one is NaN or infinite; the weights are still those before the step.
     """
-    name = next((name for name in NAMES if not math.isfinite(report.get(name, 0.0))), None)
+    name = next((name for name in NAMES if not math.isfinite(report[name])), None)
     if name is None:
         return
     step, epoch, index = run.state.step, run.state.place.epoch, run.dataset.index

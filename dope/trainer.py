@@ -78,7 +78,6 @@ def train(
                 losses = compute_losses(
                     online, state.momentum, sampled, config, ranks, step=state.step, stop=stop.requested
                 )
-                guard.require_finite(run, losses.report, batch, log)
                 state.optimiser.zero_grad(set_to_none=True)
                 losses.backward.backward()
                 report = {**losses.report, "grad_norm": guard.gradient_norm(state.network.parameters()), "lr": lr}

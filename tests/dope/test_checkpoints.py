@@ -107,10 +107,10 @@ def test_old_checkpoints_are_deleted_with_their_hashes(tmp_path: Path) -> None:
 
 
 def test_going_on_from_an_earlier_checkpoint_deletes_neither_the_new_nor_the_later_ones(tmp_path: Path) -> None:
-    for step in (2, 8, 9, 3):  # 3 after 9: a run that went back to an earlier place
-        save_checkpoint(tmp_path, at(step), keeping(keep=1), "shards")
-    assert steps_of(tmp_path) == [3, 9]
-    assert latest_checkpoint(tmp_path) == tmp_path / "checkpoints" / "step-00000003.pt"
+    for step in (2, 8, 9, 3, 4):  # 3 after 9: a run that went back to an earlier place
+        save_checkpoint(tmp_path, at(step), keeping(keep=2), "shards")
+    assert steps_of(tmp_path) == [3, 4, 8, 9]
+    assert latest_checkpoint(tmp_path) == tmp_path / "checkpoints" / "step-00000004.pt"
 
 
 def test_the_best_and_every_nth_are_kept_besides_the_newest(tmp_path: Path) -> None:
@@ -317,13 +317,14 @@ import pathlib, shutil, sys
 from test_checkpoints import CONFIG, DiskFull, at, read_checkpoint, save_checkpoint
 run = pathlib.Path(sys.argv[1]) / "run"
 size = save_checkpoint(run, at(1), CONFIG, "shards").stat().st_size
-room = shutil.disk_usage(run).free
-(run / "else").write_bytes(bytes(room - size // 2))
-try:
-    save_checkpoint(run, at(2), CONFIG, "shards")
-except DiskFull as error:
-    print(error)
-print(read_checkpoint(run)["step"], sorted(path.name for path in (run / "checkpoints").iterdir()))
+for room in (0, 8192, size // 4, size // 2, size - 4096):  # it is full in the midst of this or that part of the file
+    (run / "else").unlink(missing_ok=True)
+    (run / "else").write_bytes(bytes(shutil.disk_usage(run).free - room))
+    try:
+        save_checkpoint(run, at(2), CONFIG, "shards")
+    except DiskFull as error:
+        print(error)
+    print(read_checkpoint(run)["step"], sorted(path.name for path in (run / "checkpoints").iterdir()))
 """
 
 
@@ -344,9 +345,11 @@ def test_a_disk_that_is_really_full_keeps_the_checkpoint_before(tmp_path: Path) 
         capture_output=True, text=True, env=environment,
     )  # fmt: skip
     assert answer.returncode == 0, answer.stderr
-    said, left = answer.stdout.splitlines()
-    assert "step-00000002.pt: no space left on the disk; nothing that was there before is lost" in said
-    assert left == "1 ['latest', 'step-00000001.pt', 'step-00000001.pt.sha256']"
+    lines = answer.stdout.splitlines()
+    assert len(lines) == 10
+    for said, left in zip(lines[::2], lines[1::2], strict=True):
+        assert "step-00000002.pt: no space left on the disk; nothing that was there before is lost" in said
+        assert left == "1 ['latest', 'step-00000001.pt', 'step-00000001.pt.sha256']"
 
 
 def test_no_checkpoint_there(tmp_path: Path) -> None:
