@@ -291,15 +291,19 @@ def test_a_signal_writes_a_checkpoint_and_exits_with_75(
             if len(read_metrics(tmp_path, "step")) > 2 or process.poll() is not None:
                 break
             time.sleep(0.1)
+        job = descendants(process.pid)
         if number == signal.SIGUSR1:  # Slurm sends it to every process of the job, torchrun and workers included
-            for pid in (process.pid, *descendants(process.pid)):
+            for pid in (process.pid, *job):
                 os.kill(pid, number)
         else:
             os.killpg(process.pid, number)  # to the loader's workers too, as a batch system does
-        _, errors = process.communicate(timeout=60)
+        process.wait(timeout=60)
+        left = [pid for pid in job if is_training(pid)]
+        errors = process.communicate()[1]
     finally:
         process.terminate()
     assert process.returncode == 75, errors
+    assert not left, "it ended before the ranks had done so, perhaps before the checkpoint was written"
     assert processes > 1 or "Traceback" not in errors  # torchrun itself prints one
     steps = [line["step"] for line in read_metrics(tmp_path, "step")]
     assert [path.name for path in list_checkpoints(tmp_path)] == [f"step-{steps[-1]:08d}.pt"]
@@ -342,6 +346,14 @@ def descendants(pid: int) -> list[int]:
     for child in found:
         found += children.get(child, ())
     return found
+
+
+def is_training(pid: int) -> bool:
+    """Whether a process of `dope train` still runs; torchrun's watchers and zombies do not count."""
+    with contextlib.suppress(OSError):
+        zombie = (Path("/proc") / str(pid) / "stat").read_text().rpartition(")")[2].split()[0] == "Z"
+        return not zombie and b"cli\0train" in (Path("/proc") / str(pid) / "cmdline").read_bytes()
+    return False
 
 
 def environment() -> dict[str, str]:
