@@ -97,7 +97,13 @@ def train(
 
 @dataclass
 class Run:
-    """What a call of `train` works on, and what it does besides the steps themselves."""
+    """What a call of `train` works on, and what it does besides the steps themselves.
+
+    Attributes:
+        held_out: this rank's share of the validation pairs.
+        resumed_from: the checkpoint that it goes on from, or None.
+        damaged: what is wrong with newer checkpoints that were passed over.
+    """
 
     out: Path
     config: TrainConfig
