@@ -3,9 +3,11 @@
     RUN/checkpoints/
       step-00001200.pt          network, momentum network, optimiser, place in the order, settings, versions
       step-00001200.pt.sha256   its hash, as `sha256sum -c` reads it
-      latest                    the name of the newest one, written last
+      latest                    the name of the newest one
+      best                      with checkpoint.keep_best: the name of the one with the best PCK, and that PCK
 
-Nothing random is stored: every random number derives from (seed, step, rank).
+Nothing random is stored: every random number derives from (seed, step, rank). Files are written in this order and only
+then are old ones deleted, so that a crash at any moment leaves a checkpoint that `latest` or the list of files finds.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ import torch
 import dope
 from dope.common import files, settings
 from dope.common.errors import BadInput, UsageError
-from dope.config import TrainConfig, differing_keys
+from dope.config import CheckpointConfig, TrainConfig, differing_keys
 from dope.networks import DopeNetwork, NetworkConfig
 from dope.order import Place
 from dope.state import TrainState
@@ -28,16 +30,20 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 FORMAT = 1
-LATEST = "latest"
+LATEST, BEST = "latest", "best"
 
 
-def save_checkpoint(run: Path, state: TrainState, config: TrainConfig, dataset: str, keep: int = 0) -> Path:
-    """Write RUN/checkpoints/step-XXXXXXXX.pt, its hash and the pointer; delete old ones beyond `keep` (0 keeps all).
-
-    Those of later steps, which a run that went on from an earlier checkpoint finds there, neither count nor go.
+def save_checkpoint(
+    run: Path, state: TrainState, config: TrainConfig, dataset: str, *, best_pck: float | None = None
+) -> Path:
+    """Write RUN/checkpoints/step-XXXXXXXX.pt, its hash and the pointers; delete what `config.checkpoint` lets go.
 
     Args:
         dataset: fingerprint of the training shards.
+        best_pck: the PCK of this very step, where it is the best so far; `best` then points here.
+
+    Raises:
+        DiskFull: the checkpoints that were there before are untouched.
     """
     path = run / "checkpoints" / f"step-{state.step:08d}.pt"
     values = {
@@ -57,41 +63,87 @@ def save_checkpoint(run: Path, state: TrainState, config: TrainConfig, dataset: 
     }
     with files.atomic_path(path) as partial:
         with partial.open("wb") as file:  # given a path, torch's own writer hides that the disk is full
-            torch.save(values, file)
+            try:
+                torch.save(values, file)
+            except RuntimeError as error:  # here as well: it fails once more when it closes what it could not write
+                raise error.__context__ if isinstance(error.__context__, OSError) else error from None
         digest = files.sha256_of(partial)
+        # of a checkpoint that this one replaces: after a crash before the next line it would belie a whole file
+        _hash_path(path).unlink(missing_ok=True)
     files.write_bytes(_hash_path(path), f"{digest}  {path.name}\n".encode())
     files.write_bytes(path.parent / LATEST, f"{path.name}\n".encode())
-    if keep:
-        until_now = [other for other in list_checkpoints(run) if other.name <= path.name]
-        for old in until_now[:-keep]:
-            old.unlink()
-            _hash_path(old).unlink(missing_ok=True)
+    if best_pck is not None:
+        files.write_bytes(path.parent / BEST, f"{path.name} {best_pck}\n".encode())
+    for old in _superfluous(run, state.step, config.checkpoint):
+        _hash_path(old).unlink(missing_ok=True)
+        old.unlink(missing_ok=True)
     return path
+
+
+def _superfluous(run: Path, step: int, policy: CheckpointConfig) -> list[Path]:
+    """What goes: neither among the newest, nor a multiple of `keep_every`, nor pointed to, nor of a later step.
+
+    Later ones are found there by a run that went on from an earlier checkpoint.
+    """
+    if not policy.keep:
+        return []
+    pointed = {pointed_to(run, LATEST), pointed_to(run, BEST)}
+    until_now = [path for path in list_checkpoints(run) if _step_of(path) <= step]
+    return [
+        path
+        for path in until_now[: -policy.keep]
+        if path not in pointed and not (policy.keep_every and _step_of(path) % policy.keep_every == 0)
+    ]
 
 
 def list_checkpoints(run: Path) -> list[Path]:
     """The checkpoints of a run, oldest first."""
-    return sorted((run / "checkpoints").glob("step-*.pt"))
+    return sorted((run / "checkpoints").glob("step-" + "[0-9]" * 8 + ".pt"))
+
+
+def pointed_to(run: Path, pointer: str) -> Path | None:
+    """The checkpoint that RUN/checkpoints/latest or best names, or None where there is no such file."""
+    file = run / "checkpoints" / pointer
+    words = file.read_text(errors="replace").split() if file.is_file() else []
+    path = file.parent / words[0] if words else None
+    return path if path and path.is_file() else None
+
+
+def best_pck(run: Path, *, before: int) -> float:
+    """The PCK of the best checkpoint; minus infinity where there is none from before step `before`.
+
+    A run that goes on from an earlier checkpoint comes by its later ones again.
+    """
+    path = pointed_to(run, BEST)
+    if path is None or _step_of(path) >= before:
+        return float("-inf")
+    try:
+        return float((run / "checkpoints" / BEST).read_text().split()[1])
+    except (IndexError, ValueError):  # written by hand
+        return float("-inf")
 
 
 def latest_checkpoint(run: Path) -> Path | None:
-    """The newest whole checkpoint of a run, or None where there is none."""
-    pointer = run / "checkpoints" / LATEST
-    if pointer.is_file():
-        path = pointer.parent / pointer.read_text().strip()
-        if path.is_file():
-            return path
+    """The newest checkpoint of a run, or None where there is none."""
     known = list_checkpoints(run)
-    return known[-1] if known else None
+    return pointed_to(run, LATEST) or (known[-1] if known else None)
 
 
 def find_checkpoint(path: Path) -> Path:
-    """The checkpoint that a user means by a file or by a run's folder. Raises `BadInput` where there is none."""
-    if path.is_file():
-        return path
+    """The checkpoint that a user means by a file (also `latest` or `best`) or by a run's folder.
+
+    Raises:
+        BadInput: there is none.
+    """
     found = latest_checkpoint(path) if path.is_dir() else None
+    if path.is_file():
+        found = pointed_to(path.parent.parent, path.name) if path.name in (LATEST, BEST) else path
     if found is None:
-        what = "holds no checkpoint" if path.is_dir() else "no such file or folder"
+        what = "no such file or folder"
+        if path.is_dir():
+            what = "holds no checkpoint"
+        elif path.is_file():
+            what = "names a checkpoint that is not there"
         raise BadInput(what, where=path, remedy="Give a folder that `dope train --out` wrote, or one of its *.pt files")
     return found
 
@@ -100,21 +152,33 @@ def read_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str,
     """Read a checkpoint without running any code it might hold.
 
     Raises:
-        BadInput: unreadable, cut off, damaged since it was written, or no checkpoint of this package.
+        BadInput: unreadable, cut off, damaged since it was written, with code in it, or no checkpoint of this package.
+        UsageError: of another version of this package.
     """
     path = find_checkpoint(path)
-    others = [other.name for other in list_checkpoints(path.parent.parent) if other != path]
-    remedy = f"Give another one, e.g. {path.parent / others[-1]}" if others else "Copy it again, or train again"
+    others = [other for other in list_checkpoints(path.parent.parent) if other != path]
+    older = [other for other in others if other.name < path.name]
+    remedy = f"Give another one, e.g. {(older or others)[-1]}" if others else "Copy it again, or train again"
     recorded = _hash_path(path)
     if recorded.is_file() and recorded.read_text().split(maxsplit=1)[:1] != [files.sha256_of(path)]:
         raise BadInput(f"is damaged: its SHA-256 is not the one in {recorded.name}", where=path, remedy=remedy)
     try:
         values = torch.load(path, map_location=device, weights_only=True)
-    except (RuntimeError, pickle.UnpicklingError, EOFError, OSError, ValueError, KeyError) as error:
+    except pickle.UnpicklingError as error:
+        what = "holds something other than tensors and plain values: damage, or code, which is never run"
+        raise BadInput(what, where=path, remedy=remedy) from error
+    except (RuntimeError, EOFError, OSError, ValueError, KeyError) as error:
         reason = str(error).split("\n", 1)[0]
         raise BadInput(f"cannot be read as a checkpoint ({reason})", where=path, remedy=remedy) from error
-    if not isinstance(values, dict) or "network" not in values or values.get("format") != FORMAT:
-        raise BadInput("is no checkpoint of this version of dope", where=path, remedy=remedy)
+    if not isinstance(values, dict) or "network" not in values or "format" not in values:
+        raise BadInput("is no checkpoint of dope", where=path, remedy=remedy)
+    if values["format"] != FORMAT:
+        version = values.get("versions", {}).get("dope", "unknown")
+        raise UsageError(
+            f"was written by dope {version} in format {values['format']}; this one reads format {FORMAT}",
+            where=path,
+            remedy="Use that version of dope for this run, or train anew into another --out",
+        )
     return values
 
 
@@ -147,6 +211,61 @@ def resume(path: Path, state: TrainState, config: TrainConfig, dataset: str) -> 
     state.validation, state.untrained = values["validation"], values["untrained"]
 
 
+def resume_newest(
+    run: Path, state: TrainState, config: TrainConfig, dataset: str
+) -> tuple[Path | None, list[BadInput]]:
+    """Put `state` where the newest checkpoint of a run that can be read was; damaged ones are passed over.
+
+    Returns:
+        The checkpoint, or None where the run has none at all; and what was wrong with those passed over.
+
+    Raises:
+        BadInput: there are checkpoints, and all of them are damaged.
+        UsageError: as `resume`.
+    """
+    newest = latest_checkpoint(run)
+    if newest is None:
+        return None, []
+    damaged: list[BadInput] = []
+    for path in reversed([path for path in list_checkpoints(run) if path.name <= newest.name]):
+        try:
+            resume(path, state, config, dataset)
+        except BadInput as error:
+            damaged.append(error)
+        else:
+            return path, damaged
+    what = f"{damaged[0].what}; no older one can be read either"
+    raise BadInput(what, where=newest, remedy="Copy the run again, or train anew into another --out")
+
+
+def go_on_from(
+    how: str | Path, out: Path, state: TrainState, config: TrainConfig, dataset: str
+) -> tuple[Path | None, list[BadInput]]:
+    """Put `state` where the `how` of `dope train --resume` says: auto, never, or a checkpoint or run.
+
+    Returns:
+        The checkpoint, or None where the run begins; and what was wrong with newer ones.
+
+    Raises:
+        BadInput: no such checkpoint, or it (with `auto`, every one of the run) is damaged.
+        UsageError: as `resume`; or `never`, and `out` holds a run.
+    """
+    if how == "auto":
+        return resume_newest(out, state, config, dataset)
+    if how == "never":
+        newest = latest_checkpoint(out)
+        if newest is not None:
+            raise UsageError(
+                f"already holds a run ({newest.name})",
+                where=out,
+                remedy="Give another --out, delete this folder, or go on with --resume auto",
+            )
+        return None, []
+    found = find_checkpoint(Path(how))
+    resume(found, state, config, dataset)
+    return found, []
+
+
 def load_network(path: Path, device: torch.device | str = "cpu") -> tuple[DopeNetwork, dict[str, Any]]:
     """The trained network of a checkpoint (or of a run's newest one), in eval mode, and what is known of it.
 
@@ -167,3 +286,7 @@ def load_network(path: Path, device: torch.device | str = "cpu") -> tuple[DopeNe
 
 def _hash_path(path: Path) -> Path:
     return path.with_name(path.name + ".sha256")
+
+
+def _step_of(path: Path) -> int:
+    return int(path.stem.removeprefix("step-"))

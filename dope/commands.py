@@ -12,16 +12,18 @@ from typing import Annotated, Any
 import typer
 
 from dope.common.errors import UsageError
+from dope.preset_files import preset_names, preset_summary
 
 Shards = Annotated[Path, typer.Argument(help="The folder that `dope prep shards --out` wrote.", show_default=False)]
 Run = Annotated[Path, typer.Argument(help="A run (its newest checkpoint) or a checkpoint.", show_default=False)]
 Device = Annotated[str, typer.Option(help="auto, cpu, cuda or cuda:N.")]
+PRESETS_HELP = "\n\n".join(f"{name}: {preset_summary(name)}" for name in preset_names())
 
 
 def train(
     shards: Shards,
     out: Annotated[Path, typer.Option("--out", help="RUN: the folder of this run.", show_default=False)],
-    preset: Annotated[str, typer.Option(help="paper, or nano: a few minutes on a CPU.")] = "paper",
+    preset: Annotated[str, typer.Option(help=PRESETS_HELP)] = "paper",
     config: Annotated[
         Path | None, typer.Option("--config", help="YAML file of settings, on top of the preset.", show_default=False)
     ] = None,
@@ -36,12 +38,19 @@ def train(
     stop_after: Annotated[
         int | None, typer.Option(min=1, help="Stop with a checkpoint after so many steps.", show_default=False)
     ] = None,
+    profile: Annotated[
+        int | None,
+        typer.Option(min=1, help="Profile so many steps into RUN/profile, then train on.", show_default=False),
+    ] = None,
 ) -> None:
     """Train DOPE: corresponding pixels of two views get the same descriptor, all others different ones.
 
     RUN receives config.yaml (all settings, to look up and to change by --set), checkpoints/, metrics.jsonl and
-    tensorboard/. Run it again to go on; SIGTERM and Ctrl-C write a checkpoint and exit with 75, on which a batch
-    system can requeue.
+    tensorboard/. Run it again to go on; SIGTERM, SIGUSR1 and Ctrl-C write a checkpoint and exit with 75, on which a
+    batch system can requeue.
+
+    Slurm, in a script with #SBATCH --requeue and --signal=USR1@120 (the signal comes 120 s before the limit):
+    srun dope train shards --out run || { [ $? = 75 ] && scontrol requeue $SLURM_JOB_ID; }
 
     Examples:
 
@@ -63,7 +72,7 @@ def train(
     from dope.stop_signals import EXIT_STOPPED
     from dope.trainer import train as run_training
 
-    result = run_training(shards, out, resolved, resume=resume, stop_after=stop_after)
+    result = run_training(shards, out, resolved, resume=resume, stop_after=stop_after, profile=profile or 0)
     if os.environ.get("RANK", "0") == "0":
         _print_training(result, out)
     raise typer.Exit(EXIT_STOPPED if result["status"] == "stopped" and stop_after is None else 0)
@@ -189,13 +198,16 @@ def figure(
 def _launch(nproc: int) -> int:
     """Start this very command under torchrun, without --nproc's effect in the children (they see RANK).
 
-    SIGTERM and Ctrl-C are handed on, and torchrun lets the processes write a checkpoint (it waits 30 s). It ends with
-    1 however they ended; a run that was asked to stop ends with 75 here, as that of one process does.
+    SIGTERM, SIGUSR1 and Ctrl-C are handed on as SIGTERM, and torchrun lets the processes write a checkpoint (it waits
+    30 s). It ends with 1 however they ended; a run that was asked to stop ends with 75 here, as that of one process
+    does.
     """
-    from dope.stop_signals import EXIT_STOPPED
+    from dope.stop_signals import EXIT_STOPPED, STOP_SIGNALS
 
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(nproc)]
     asked = False
+    # torchrun inherits this: Slurm sends SIGUSR1 to every process, and torchrun would die of it
+    signal.signal(signal.SIGUSR1, signal.SIG_IGN)
     # "--", or torchrun takes our --nproc for its own; its own process group, or Ctrl-C of a terminal reaches it twice
     process = subprocess.Popen([*command, "-m", "--", "cli", *sys.argv[1:]], start_new_session=True)
 
@@ -204,7 +216,7 @@ def _launch(nproc: int) -> int:
         asked = True
         process.terminate()
 
-    for number in (signal.SIGTERM, signal.SIGINT):
+    for number in STOP_SIGNALS:
         signal.signal(number, hand_on)
     code = process.wait()
     return EXIT_STOPPED if asked and code else code

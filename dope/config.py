@@ -1,4 +1,4 @@
-"""The settings of a training run: one frozen dataclass, two presets, and `load_config` that resolves them.
+"""The settings of a training run: one frozen dataclass, and `load_config` that resolves presets, files and overrides.
 
 The defaults are the paper's, so `TrainConfig()` and the preset `paper` are the same run.
 """
@@ -7,17 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Literal
 
+import yaml as pyyaml
+
 from dope.augmentation import AugmentationConfig
-from dope.common import settings
+from dope.common import files, settings
 from dope.common.errors import UsageError
 from dope.networks import NetworkConfig
+from dope.preset_files import merged, preset_values
 
-PRESETS = Path(__file__).parent / "presets"
-RESULT_NEUTRAL = ("data.workers", "device", "validation", "checkpoint", "log_every")
+RESULT_NEUTRAL = ("data.workers", "device", "validation", "checkpoint", "log")
 """Settings that do not change what is learnt: a run may be resumed with other values of these."""
 
 
@@ -95,12 +96,30 @@ class ValidationConfig:
 
 @dataclass(frozen=True)
 class CheckpointConfig:
-    """RUN/checkpoints/step-XXXXXXXX.pt; one is always written at the end and on SIGTERM."""
+    """RUN/checkpoints/step-XXXXXXXX.pt; one is always written at the end and when a signal stops the run."""
 
     every: int = 50
-    """Epochs between two checkpoints; 0 writes only the last."""
+    """Epochs between two checkpoints; 0 = none in between."""
+    every_steps: int = 0
+    """Steps between two checkpoints, besides those of `every`; 0 = none."""
     keep: int = 0
     """The newest checkpoints to keep; 0 keeps all of them."""
+    keep_best: bool = False
+    """Write one at each validation with the best PCK so far, and keep the best besides (RUN/checkpoints/best)."""
+    keep_every: int = 0
+    """Checkpoints of steps that are multiples of this are never deleted; 0 = none."""
+
+
+@dataclass(frozen=True)
+class LogConfig:
+    """What a run tells besides its progress: RUN/metrics.jsonl and RUN/tensorboard, always; W&B on request."""
+
+    every: int = 10
+    """Steps between two lines of metrics.jsonl and two points of the curves."""
+    pictures: int = 4
+    """Held-out pairs drawn at each validation (a point found again, predicted masks); 0 = none."""
+    wandb: str = ""
+    """Project of Weights & Biases that gets the same; empty = none. Needs `pip install 'dope-descriptors[wandb]'`."""
 
 
 @dataclass(frozen=True)
@@ -145,15 +164,10 @@ class TrainConfig:
     """bf16 runs the encoders in autocast; losses stay in fp32. Slow on most CPUs."""
     device: str = "auto"
     """auto (CUDA where there is one), cpu, cuda or cuda:N."""
-    log_every: int = 10
-    """Steps between two lines of metrics.jsonl."""
+    log: LogConfig = field(default_factory=LogConfig)
+    """Curves and pictures."""
     seed: int = 12345
     """Everything random derives from it."""
-
-
-def preset_names() -> list[str]:
-    """Names that `load_config` knows, sorted."""
-    return sorted(path.stem for path in PRESETS.glob("*.yaml"))
 
 
 def load_config(preset: str | None = None, yaml: Path | None = None, overrides: Iterable[str] = ()) -> TrainConfig:
@@ -162,24 +176,25 @@ def load_config(preset: str | None = None, yaml: Path | None = None, overrides: 
     Raises:
         UsageError: an unknown preset or key (the closest known one is named), a value of the wrong type or range.
     """
-    values: dict[str, Any] = {}
-    if preset is not None:
-        if preset not in preset_names():
-            close = get_close_matches(preset, preset_names(), n=1)
-            hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(preset_names())}"
-            raise UsageError(f"unknown preset '{preset}' ({hint})", where="--preset")
-        values = settings.load_yaml(PRESETS / f"{preset}.yaml")
+    values = {} if preset is None else preset_values(preset)
     if yaml is not None:
-        values = _merged(values, settings.load_yaml(yaml))
+        values = merged(values, settings.load_yaml(yaml))
     where = str(yaml) if yaml is not None else f"preset {preset}"
     config = settings.override(settings.from_mapping(TrainConfig, values, where=where), overrides)
     check(config)
     return config
 
 
+def write_config(path: Path, config: TrainConfig) -> None:
+    """Write the resolved settings as YAML, which `--config` reads again, with its hash in the first line."""
+    text = pyyaml.safe_dump(_plain(settings.to_dict(config)), sort_keys=False, allow_unicode=True)
+    files.write_bytes(path, f"# hash {settings.config_hash(config)}\n{text}".encode())
+
+
 def check(config: TrainConfig) -> None:
     """Raise `UsageError` naming the first setting whose value makes no sense."""
     data, schedule, network, augmentation = config.data, config.schedule, config.network, config.augmentation
+    keep_best = config.checkpoint.keep_best
     rules = (
         ("data.image_size", data.image_size >= 32 and data.image_size % 32 == 0, "must be a positive multiple of 32"),
         ("data.batch_size", data.batch_size >= 2, "must be at least 2: the other pairs of a batch are the negatives"),
@@ -205,8 +220,12 @@ def check(config: TrainConfig) -> None:
         ("validation.pairs", config.validation.pairs >= 1, "must be at least 1 (validation.every=0 turns it off)"),
         ("validation.batch_size", config.validation.batch_size >= 1, "must be at least 1"),
         ("checkpoint.every", config.checkpoint.every >= 0, "must not be negative"),
+        ("checkpoint.every_steps", config.checkpoint.every_steps >= 0, "must not be negative"),
         ("checkpoint.keep", config.checkpoint.keep >= 0, "must not be negative"),
-        ("log_every", config.log_every >= 1, "must be at least 1"),
+        ("checkpoint.keep_every", config.checkpoint.keep_every >= 0, "must not be negative"),
+        ("checkpoint.keep_best", not keep_best or config.validation.every > 0, "needs validation.every of 1 or more"),
+        ("log.every", config.log.every >= 1, "must be at least 1"),
+        ("log.pictures", config.log.pictures >= 0, "must not be negative"),
     )
     for key, ok, rule in rules:
         if not ok:
@@ -229,6 +248,12 @@ def differing_keys(ours: dict[str, Any], theirs: dict[str, Any]) -> dict[str, tu
     }
 
 
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(inner) for key, inner in value.items()}
+    return [_plain(inner) for inner in value] if isinstance(value, (list, tuple)) else value
+
+
 def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for key, value in values.items():
@@ -237,11 +262,3 @@ def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
         else:
             flat[prefix + key] = list(value) if isinstance(value, tuple) else value
     return flat
-
-
-def _merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
-    merged = dict(below)
-    for key, value in above.items():
-        inner = merged.get(key)
-        merged[key] = _merged(inner, value) if isinstance(inner, dict) and isinstance(value, dict) else value
-    return merged

@@ -57,6 +57,7 @@ REQUIRED = (
 
 OPTIONAL = (
     ("Blender (bpy)", "bpy", "photoreal renders of meshes (planned)", "pip install '.[blender]' (Python 3.11 or 3.13)"),
+    ("Weights & Biases", "wandb", "--set log.wandb=PROJECT of dope train", "pip install 'dope-descriptors[wandb]'"),
     ("Ray", "ray", "preparation on a cluster (planned)", "pip install '.[ray]'"),
 )
 

@@ -1,4 +1,7 @@
-"""What a run says: metrics.jsonl for programs, TensorBoard for eyes, one line of progress for whoever started it."""
+"""What a run says: metrics.jsonl for programs, TensorBoard for eyes, one line of progress for whoever started it.
+
+Weights & Biases gets what TensorBoard gets, where `log.wandb` names a project.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ import math
 import sys
 import time
 from collections.abc import Mapping
+from datetime import timedelta
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -15,6 +19,9 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from dope.common import files
+from dope.figures.drawing import Image, as_png
+from dope.meter import Meter
+from dope.wandb_run import WandbRun
 
 METRICS = "metrics.jsonl"
 
@@ -22,16 +29,20 @@ METRICS = "metrics.jsonl"
 class RunLog:
     """Writes RUN/metrics.jsonl and RUN/tensorboard and shows progress; use as a context manager, on the first rank.
 
-    A line of metrics.jsonl has `event` (start, step, validation, checkpoint, not_finite, end), `step`, `epoch` and the
-    values.
+    A line of metrics.jsonl has `event` (start, damaged_checkpoint, step, validation, checkpoint, not_finite, end),
+    `step`, `epoch` and the values.
 
     Args:
         run: the folder.
         start: steps already done; lines of later steps, left by a run that was killed, are removed.
         total: steps of the whole run.
+        wandb: project of Weights & Biases, or empty.
+        config: the resolved settings, which W&B shows beside the run.
     """
 
-    def __init__(self, run: Path, *, start: int, total: int) -> None:
+    def __init__(
+        self, run: Path, *, start: int, total: int, wandb: str = "", config: Mapping[str, Any] | None = None
+    ) -> None:
         from torch.utils.tensorboard import SummaryWriter
 
         self._path = run / METRICS
@@ -52,6 +63,7 @@ class RunLog:
             self._task = self._progress.add_task("", total=total, completed=start)
         self._total, self._pck, self._line_due = total, "", 0.0
         self._began, self._began_at = time.perf_counter(), start
+        self._wandb = WandbRun(wandb, run, config or {}, self.say) if wandb else None
 
     def __enter__(self) -> RunLog:
         if self._progress:
@@ -65,9 +77,11 @@ class RunLog:
             self._progress.stop()
         self._file.close()
         self._board.close()
+        if self._wandb:
+            self._wandb.close(failed=error is not None)
 
     def event(self, event: str, step: int, epoch: int, values: Mapping[str, Any]) -> None:
-        """Append one line to metrics.jsonl, and the numbers among the values to TensorBoard."""
+        """Append one line to metrics.jsonl; numbers of steps and validations go to TensorBoard and W&B as well."""
         line = {"event": event, "step": step, "epoch": epoch, **values}
         # JSON has no NaN
         whole = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in line.items()}
@@ -77,19 +91,33 @@ class RunLog:
             for name, value in values.items():
                 if isinstance(value, (int, float)):
                     self._board.add_scalar(f"{event}/{name}", value, step)
+            if self._wandb:
+                self._wandb.numbers(event, step, values)
         if event == "validation":
             self._pck = f"  PCK {values['pck']:.3f}  mask IoU {values['mask_iou']:.2f}"
             self.say(f"step {step:6d}{self._pck} on {values['points']} points of {values['pairs']} held-out pairs")
 
-    def progress(self, step: int, loss: float, pairs_per_second: float) -> None:
+    def picture(self, name: str, step: int, image: Image) -> None:
+        """Show an image (H, W, 3) uint8 RGB in TensorBoard and W&B."""
+        from tensorboard.compat.proto.summary_pb2 import Summary
+
+        # not add_image, which needs Pillow
+        height, width = image.shape[:2]
+        shown = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=as_png(image))
+        self._board._get_file_writer().add_summary(Summary(value=[Summary.Value(tag=name, image=shown)]), step)
+        if self._wandb:
+            self._wandb.picture(name, step, image)
+
+    def progress(self, step: int, meter: Meter) -> None:
         """Show where the run is: a live line in a terminal, else a plain line every few seconds."""
-        text = f"loss {loss:.4f}  {pairs_per_second:.1f} pairs/s{self._pck}"
+        speed = f"{meter.pairs_per_second:.1f} pairs/s  data wait {meter.data_wait:.0%}"
+        text = f"{speed}  loss {meter.loss:.4f}{self._pck}"
         if self._progress:
             self._progress.update(self._task, completed=step, description=text)
         elif time.perf_counter() >= self._line_due or step == self._total:
             self._line_due = time.perf_counter() + 5
             left = (time.perf_counter() - self._began) / max(1, step - self._began_at) * (self._total - step)
-            self.say(f"step {step:6d}/{self._total}  {text}  {left:.0f} s left")
+            self.say(f"step {step:6d}/{self._total}  {text}  {timedelta(seconds=round(left))} left")
 
     def say(self, text: str) -> None:
         """Print a line above the progress."""
@@ -111,36 +139,27 @@ class SilentLog:
     def event(self, event: str, step: int, epoch: int, values: Mapping[str, Any]) -> None:
         """Nothing."""
 
-    def progress(self, step: int, loss: float, pairs_per_second: float) -> None:
+    def picture(self, name: str, step: int, image: Image) -> None:
+        """Nothing."""
+
+    def progress(self, step: int, meter: Meter) -> None:
         """Nothing."""
 
     def say(self, text: str) -> None:
         """Nothing."""
 
 
-class Meter:
-    """Loss and speed of a call of `train`; speed over the last steps, without the first, which warms up."""
-
-    def __init__(self, first_step: int, window: int = 50) -> None:
-        self.first_step, self.loss = first_step, float("nan")
-        self._began = time.perf_counter()
-        self._marks, self._window = [(self._began, 0)], window
-
-    def add(self, pairs: int, loss: float) -> None:
-        """Note a step."""
-        self.loss = loss
-        self._marks = [*self._marks[-self._window :], (time.perf_counter(), self._marks[-1][1] + pairs)]
-
-    @property
-    def seconds(self) -> float:
-        """Since the beginning."""
-        return time.perf_counter() - self._began
-
-    @property
-    def pairs_per_second(self) -> float:
-        """Of all ranks together; 0 before the first step."""
-        marks = self._marks[1:] if len(self._marks) > 2 else self._marks
-        return (marks[-1][1] - marks[0][1]) / max(1e-9, marks[-1][0] - marks[0][0])
+def describe_start(facts: dict[str, Any]) -> str:
+    """The first lines that a run says."""
+    ranks = "" if facts["world"] == 1 else f" on {facts['world']} ranks"
+    lines = [
+        f"training on {facts['pairs']:,} pairs of {facts['objects']:,} objects: {facts['batch_size']} pairs a step, "
+        f"{facts['steps_per_epoch']:,} steps an epoch, {facts['total_steps']:,} in all",
+        f"{facts['parameters'] / 1e6:.1f} M parameters, {facts['precision']}, {facts['device']}{ranks}",
+    ]
+    if facts["resumed_from"]:
+        lines.append(f"going on at step {facts['resumed_at']:,} from {facts['resumed_from']}")
+    return "\n".join(lines)
 
 
 def read_metrics(run: Path, event: str | None = None) -> list[dict[str, Any]]:

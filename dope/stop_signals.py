@@ -1,4 +1,4 @@
-"""SIGTERM and Ctrl-C as a request: finish the step, write a checkpoint, leave."""
+"""SIGTERM, SIGUSR1 and Ctrl-C as a request: finish the step, write a checkpoint, leave."""
 
 from __future__ import annotations
 
@@ -8,10 +8,15 @@ from types import FrameType
 from typing import Any
 
 EXIT_STOPPED = 75  # EX_TEMPFAIL: stopped with a checkpoint; the same command goes on
+STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
 
 
 class StopRequest:
-    """Turns the first SIGTERM or Ctrl-C into a request to stop after the step; a second one acts as usual."""
+    """Turns the first of `STOP_SIGNALS` into a request to stop after the step.
+
+    A second Ctrl-C acts as usual. Batch systems repeat themselves (Slurm sends SIGUSR1 to every process, torchrun
+    hands SIGTERM on): of theirs, all after the first are ignored until the checkpoint is written.
+    """
 
     def __init__(self) -> None:
         self.requested = False
@@ -19,16 +24,14 @@ class StopRequest:
 
     def __enter__(self) -> StopRequest:
         if threading.current_thread() is threading.main_thread():
-            self._before = {number: signal.signal(number, self._note) for number in (signal.SIGTERM, signal.SIGINT)}
+            self._before = {number: signal.signal(number, self._note) for number in STOP_SIGNALS}
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._restore()
+        while self._before:
+            signal.signal(*self._before.popitem())
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         self.requested = True
-        self._restore()
-
-    def _restore(self) -> None:
-        while self._before:
-            signal.signal(*self._before.popitem())
+        if number == signal.SIGINT and signal.SIGINT in self._before:
+            signal.signal(signal.SIGINT, self._before.pop(signal.SIGINT))

@@ -18,6 +18,7 @@ from torch.utils.data import DataLoader, Dataset
 from dope.batch import PairBatch
 from dope.common.errors import BadInput, DopeError
 from dope.shard_index import SampleIndex, read_index
+from dope.stop_signals import STOP_SIGNALS
 from dope.tar_samples import REMAKE, ShardReader
 
 
@@ -174,10 +175,10 @@ def _collate_or_error(pairs: list[DecodedPair | DopeError]) -> PairBatch | DopeE
 
 def _quiet_worker(_: int) -> None:
     cv2.setNumThreads(0)  # the workers are the parallelism
-    # a SIGTERM or Ctrl-C to the whole process group must leave time for the trainer's checkpoint; workers end when
-    # the loader says so or when their parent is gone
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # a signal to the whole process group must leave time for the trainer's checkpoint; workers end when the loader
+    # says so or when their parent is gone
+    for number in STOP_SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
 
 
 def _decoded(members: dict[str, bytes], name: str, flags: int, where: str) -> NDArray[np.uint8]:

@@ -36,7 +36,7 @@ def pck(network: DopeNetwork, loader: Iterable[PairBatch], *, points: int = 32, 
     """
     device = next(network.parameters()).device
     totals = torch.zeros(4, dtype=torch.float64, device=device)  # hits, points, sum of IoU, pairs
-    with _evaluating(network):
+    with evaluating(network):
         for loaded in loader:
             batch = no_augmentation(loaded.to(device))
             first, second = network(batch.images1), network.descriptors(batch.images2)
@@ -78,7 +78,8 @@ def mask_iou(mask_logits: Tensor, masks: Tensor) -> Tensor:
 
 
 @contextmanager
-def _evaluating(network: DopeNetwork) -> Iterator[None]:
+def evaluating(network: DopeNetwork) -> Iterator[None]:
+    """The network in eval mode; its mode is restored."""
     training = network.training
     network.eval()
     try:

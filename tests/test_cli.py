@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import cli
+from dope.preset_files import preset_names, preset_summary
 
 ROOT = Path(__file__).parents[1]
 
@@ -102,3 +104,10 @@ def test_what_stops_a_command_from_outside_is_explained(
     with pytest.raises(SystemExit) as end:
         cli.main()
     assert end.value.code == code and message in capsys.readouterr().err
+
+
+def test_the_help_of_train_lists_every_preset_and_how_to_requeue() -> None:
+    text = " ".join(dope("train", "--help", env={**os.environ, "COLUMNS": "200"}).stdout.replace("│", " ").split())
+    for name in preset_names():
+        assert f"{name}: {preset_summary(name)}" in text
+    assert "#SBATCH --requeue and --signal=USR1@120" in text and "[ $? = 75 ] && scontrol requeue $SLURM_JOB_ID" in text

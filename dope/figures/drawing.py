@@ -121,10 +121,15 @@ def write_png(path: Path, image: Image) -> None:
     """Write RGB as PNG, whole or not at all."""
     if path.suffix.lower() != ".png":
         raise UsageError("figures are PNG files", where=path, remedy="Give --out a name that ends in .png")
+    files.write_bytes(path, as_png(image))
+
+
+def as_png(image: Image) -> bytes:
+    """RGB as the bytes of a PNG file."""
     ok, data = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))
     if not ok:
-        raise BadInput("image could not be encoded", where=path)
-    files.write_bytes(path, data.tobytes())
+        raise BadInput(f"an image of shape {image.shape} could not be encoded")
+    return data.tobytes()
 
 
 def _text_width(text: str, scale: float) -> int:

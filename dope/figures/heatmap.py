@@ -55,16 +55,11 @@ def similarity_heatmap(
     maps = describe(network, photos, masks, image_size=image_size, device=device)
     point = innermost(maps[0], names[0] if names else "view 0") if point is None else _inside(point, photos[0])
     similarity = similarities(maps, point)
-    best = [point, *(_best(view) for view in similarity[1:])]
-    on_object = np.concatenate([values[view.object] for values, view in zip(similarity, maps, strict=True)])
-    low, high = np.percentile(on_object, [2, 100]) if len(on_object) else (0.0, 1.0)
+    best = [point, *(best_place(view) for view in similarity[1:])]
+    heated, low, high = heat_maps(maps, similarity)
     found = [float(values[int(y), int(x)]) for values, (x, y) in zip(similarity, best, strict=True)]
     columns = [f"{name} {value:.2f}".strip() for name, value in zip(names or [""] * len(maps), found, strict=True)]
     columns[0] = f"{names[0] if names else ''} query".strip()
-    heated = [
-        over(dimmed(view.photo), heat((values - low) / max(high - low, 1e-6)), 0.9 * view.mask)
-        for view, values in zip(maps, similarity, strict=True)
-    ]
     rows = [
         Row(
             "point, and\nwhere it is\nfound", [put_marker(view.photo, xy) for view, xy in zip(maps, best, strict=True)]
@@ -88,16 +83,30 @@ def similarities(maps: Sequence[DescriptorMap], point: Point) -> list[NDArray[np
     return [(view.upsampled(*view.mask.shape) @ query).cpu().numpy() * view.mask for view in maps]
 
 
+def heat_maps(
+    maps: Sequence[DescriptorMap], similarity: Sequence[NDArray[np.floating]]
+) -> tuple[list[Image], float, float]:
+    """Similarities (H, W) in colours over the dimmed photos, on one scale, and the ends of that scale."""
+    on_object = np.concatenate([values[view.object] for values, view in zip(similarity, maps, strict=True)])
+    low, high = np.percentile(on_object, [2, 100]).tolist() if len(on_object) else (0.0, 1.0)
+    heated = [
+        over(dimmed(view.photo), heat((values - low) / max(high - low, 1e-6)), 0.9 * view.mask)
+        for view, values in zip(maps, similarity, strict=True)
+    ]
+    return heated, low, high
+
+
 def innermost(view: DescriptorMap, name: str) -> Point:
     """The object's pixel farthest from its border. Raises `BadInput` where there is no object."""
     if not view.object.any():
         remedy = "Give --point, choose another view, or --masks given"
         raise BadInput("no object is seen in the view that should hold the point", where=name, remedy=remedy)
     padded = np.pad(view.object.astype(np.uint8), 1)
-    return _best(cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1])
+    return best_place(cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1])
 
 
-def _best(values: NDArray[Any]) -> Point:
+def best_place(values: NDArray[Any]) -> Point:
+    """x, y of the highest of the values (H, W), pixel centres at +0.5."""
     row, column = np.unravel_index(int(values.argmax()), values.shape)
     return float(column) + 0.5, float(row) + 0.5
 

@@ -1,27 +1,32 @@
 import os
 import pickle
+import shutil
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import pytest
 import torch
 
+from dope import checkpoints
 from dope.checkpoints import (
+    best_pck,
     find_checkpoint,
     latest_checkpoint,
     list_checkpoints,
     load_network,
     read_checkpoint,
     resume,
+    resume_newest,
     save_checkpoint,
 )
-from dope.common import files
+from dope.common import files, settings
 from dope.common.errors import BadInput, DiskFull, UsageError
-from dope.config import TrainConfig, load_config
+from dope.config import CheckpointConfig, LogConfig, TrainConfig, load_config
 from dope.distributed import Ranks
 from dope.order import Place
 from dope.state import TrainState, new_state
@@ -29,6 +34,18 @@ from dope.state import TrainState, new_state
 SMALL = ["network.width=0.125", "network.pyramid=8", "network.projector=[8, 4]", "data.image_size=32"]
 CONFIG = load_config("nano", None, SMALL)
 ALONE = Ranks(0, 1, torch.device("cpu"))
+
+
+def keeping(**policy: Any) -> TrainConfig:
+    return replace(CONFIG, checkpoint=CheckpointConfig(**policy))
+
+
+def at(step: int) -> TrainState:
+    return replace(new_state(CONFIG, ALONE), step=step)
+
+
+def steps_of(run: Path) -> list[int]:
+    return [int(path.stem[-8:]) for path in list_checkpoints(run)]
 
 
 def trained(config: TrainConfig = CONFIG, steps: int = 2) -> TrainState:
@@ -81,9 +98,8 @@ def test_the_hash_beside_it_is_what_sha256sum_checks(run: Path) -> None:
 
 
 def test_old_checkpoints_are_deleted_with_their_hashes(tmp_path: Path) -> None:
-    state = trained(steps=0)
-    for state.step in (5, 10, 15, 20):
-        save_checkpoint(tmp_path, state, CONFIG, "shards", keep=2)
+    for step in (5, 10, 15, 20):
+        save_checkpoint(tmp_path, at(step), keeping(keep=2), "shards")
     names = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
     stems = ["step-00000015.pt", "step-00000020.pt"]
     assert names == sorted(["latest", *stems, *(stem + ".sha256" for stem in stems)])
@@ -91,10 +107,80 @@ def test_old_checkpoints_are_deleted_with_their_hashes(tmp_path: Path) -> None:
 
 
 def test_going_on_from_an_earlier_checkpoint_deletes_neither_the_new_nor_the_later_ones(tmp_path: Path) -> None:
-    for step in (2, 8, 9, 3):  # 3 after 9: a run that went back to an earlier place
-        save_checkpoint(tmp_path, replace(trained(steps=0), step=step), CONFIG, "shards", keep=1)
-    assert [path.name for path in list_checkpoints(tmp_path)] == ["step-00000003.pt", "step-00000009.pt"]
-    assert latest_checkpoint(tmp_path) == tmp_path / "checkpoints" / "step-00000003.pt"
+    for step in (2, 8, 9, 3, 4):  # 3 after 9: a run that went back to an earlier place
+        save_checkpoint(tmp_path, at(step), keeping(keep=2), "shards")
+    assert steps_of(tmp_path) == [3, 4, 8, 9]
+    assert latest_checkpoint(tmp_path) == tmp_path / "checkpoints" / "step-00000004.pt"
+
+
+def test_the_best_and_every_nth_are_kept_besides_the_newest(tmp_path: Path) -> None:
+    policy, measured = keeping(keep=1, keep_best=True, keep_every=20), {10: 0.2, 30: 0.6, 50: 0.4}
+    for step in range(10, 80, 10):
+        pck = measured.get(step)
+        is_best = pck is not None and pck > best_pck(tmp_path, before=step)
+        save_checkpoint(tmp_path, at(step), policy, "shards", best_pck=pck if is_best else None)
+    assert steps_of(tmp_path) == [20, 30, 40, 60, 70]
+    assert (tmp_path / "checkpoints/best").read_text() == "step-00000030.pt 0.6\n"
+    assert read_checkpoint(tmp_path / "checkpoints/best")["step"] == 30
+    assert read_checkpoint(tmp_path / "checkpoints/latest")["step"] == 70
+    assert load_network(tmp_path / "checkpoints/best")[1]["step"] == 30  # what `dope eval` does with it
+    assert best_pck(tmp_path, before=31) == 0.6
+    assert best_pck(tmp_path, before=30) == float("-inf")  # gone back: the run comes by it again
+    find_checkpoint(tmp_path / "checkpoints/best").unlink()
+    with pytest.raises(BadInput, match="best: names a checkpoint that is not there"):
+        find_checkpoint(tmp_path / "checkpoints/best")
+
+
+def test_a_pointer_protects_what_it_names_whatever_the_policy(tmp_path: Path) -> None:
+    save_checkpoint(tmp_path, at(1), keeping(keep_best=True), "shards", best_pck=0.5)
+    for step in (2, 3):
+        save_checkpoint(tmp_path, at(step), keeping(keep=1), "shards")
+    assert steps_of(tmp_path) == [1, 3]
+
+
+class Crash(BaseException):
+    """The machine goes down: nothing runs any more, no `finally` either."""
+
+
+@pytest.mark.parametrize("step", [2, 7])
+def test_a_crash_at_any_moment_leaves_a_checkpoint_that_can_be_gone_on_from(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int
+) -> None:
+    """Over an earlier checkpoint of the same step, and beside an older one that is then deleted."""
+    policy, crashes = keeping(keep=1, keep_best=True), 0
+    changes = {name: getattr(Path, name) for name in ("replace", "unlink")}
+    first, back = trained(), new_state(CONFIG, ALONE)
+    save_checkpoint(tmp_path / "before", first, CONFIG, "shards", best_pck=0.1)
+    state = replace(first, step=step, place=Place(3, 0))
+    while True:
+        run, done = Path(shutil.copytree(tmp_path / "before", tmp_path / str(crashes))), 0
+
+        def crashing(name: str) -> Callable[..., Any]:
+            def change(path: Path, *arguments: Any, **options: Any) -> Any:
+                nonlocal done
+                done += 1
+                if done > crashes:  # noqa: B023
+                    raise Crash
+                return changes[name](path, *arguments, **options)
+
+            return change
+
+        with monkeypatch.context() as patch:
+            for name in changes:
+                patch.setattr(Path, name, crashing(name))
+            try:
+                save_checkpoint(run, state, policy, "shards", best_pck=0.2)
+                crashed = False
+            except Crash:
+                crashed = True
+        found, damaged = resume_newest(run, back, CONFIG, "shards")
+        assert found is not None and not damaged
+        assert (back.step, back.place) in ((2, Place(1, 32)), (step, Place(3, 0)))
+        assert read_checkpoint(run / "checkpoints/best")["step"] in (2, step)
+        if not crashed:
+            break
+        crashes += 1
+    assert crashes >= 8 and steps_of(run) == [step] and back.place == Place(3, 0)
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's /dev/full")
@@ -141,30 +227,129 @@ def text(path: Path) -> None:
     path.write_text("not a checkpoint")
 
 
+class Malicious:
+    """Runs a command when it is unpickled, in the folder of whoever does that."""
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return os.system, ("touch was-run",)
+
+
 def code(path: Path) -> None:
-    path.write_bytes(pickle.dumps({"network": subprocess.Popen}, protocol=2))
+    path.write_bytes(pickle.dumps({"network": Malicious()}, protocol=2))
+
+
+def code_in_a_whole_checkpoint(path: Path) -> None:
+    torch.save({**torch.load(path, weights_only=True), "validation": Malicious()}, path)
 
 
 def other_dict(path: Path) -> None:
     torch.save({"weights": 1}, path)
 
 
+DAMAGES = (truncate, empty, text, code, code_in_a_whole_checkpoint, other_dict)
+
+
 # one flipped byte of a weight can only be found by the hash
 @pytest.mark.parametrize(
     ("damage", "with_hash"),
-    [(flip, True), *((d, with_hash) for d in (truncate, empty, text, code, other_dict) for with_hash in (True, False))],
+    [(flip, True), *((d, with_hash) for d in DAMAGES for with_hash in (True, False))],
 )
 def test_damage_is_an_error_that_names_the_file_and_another_checkpoint(
     run: Path, damage: Callable[[Path], None], with_hash: bool
 ) -> None:
-    state = trained(steps=0)
-    state.step = 9
-    path = save_checkpoint(run, state, CONFIG, "shards")
+    path = save_checkpoint(run, at(9), CONFIG, "shards")
     damage(path)
     if not with_hash:
         path.with_name(path.name + ".sha256").unlink()
     with pytest.raises(BadInput, match=r"step-00000009\.pt: .*step-00000002\.pt"):
         load_network(run)
+
+
+@pytest.mark.parametrize("with_code", [code, code_in_a_whole_checkpoint])
+def test_code_in_a_checkpoint_is_never_run(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, with_code: Callable[[Path], None]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (path,) = list_checkpoints(run)
+    with_code(path)
+    path.with_name(path.name + ".sha256").write_text(f"{files.sha256_of(path)}  {path.name}\n")  # a careful attacker
+    with pytest.raises(BadInput, match="code, which is never run"):
+        read_checkpoint(path)
+    assert not Path("was-run").exists()
+    with suppress(RuntimeError):  # the bare pickle turns out to be no checkpoint, but only once it has run
+        torch.load(path, weights_only=False)
+    assert Path("was-run").exists(), "it would have run"
+
+
+def test_another_format_is_refused_with_what_to_do(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    save_checkpoint(run, at(9), CONFIG, "shards")
+    monkeypatch.setattr(checkpoints, "FORMAT", checkpoints.FORMAT + 1)
+    message = rf"step-00000009\.pt: was written by dope {checkpoints.dope.__version__} in format 1; .*Use that version"
+    for read in (read_checkpoint, load_network):
+        with pytest.raises(UsageError, match=message):
+            read(run)
+    with pytest.raises(UsageError, match="in format 1"):  # nor is an older one taken in its place
+        resume_newest(run, new_state(CONFIG, ALONE), CONFIG, "shards")
+
+
+@pytest.mark.parametrize("damage", [flip, truncate, empty])
+def test_going_on_passes_over_damaged_checkpoints(tmp_path: Path, damage: Callable[[Path], None]) -> None:
+    paths = [save_checkpoint(tmp_path, at(step), keeping(keep=0), "shards") for step in (3, 6, 9)]
+    for path in paths[1:]:
+        damage(path)
+    state = new_state(CONFIG, ALONE)
+    found, damaged = resume_newest(tmp_path, state, CONFIG, "shards")
+    assert found == paths[0] and state.step == 3
+    assert [error.where for error in damaged] == [str(paths[2]), str(paths[1])]
+    damage(paths[0])
+    with pytest.raises(BadInput, match=r"step-00000009\.pt: .*no older one can be read either"):
+        resume_newest(tmp_path, state, CONFIG, "shards")
+
+
+def test_every_checkpoint_has_the_settings_and_their_hash(run: Path) -> None:
+    values = read_checkpoint(run)
+    assert settings.from_mapping(TrainConfig, values["config"]) == CONFIG
+    assert values["config_hash"] == settings.config_hash(CONFIG)
+
+
+ON_A_FULL_DISK = """
+import pathlib, shutil, sys
+from test_checkpoints import CONFIG, DiskFull, at, read_checkpoint, save_checkpoint
+run = pathlib.Path(sys.argv[1]) / "run"
+size = save_checkpoint(run, at(1), CONFIG, "shards").stat().st_size
+for room in (0, 8192, size // 4, size // 2, size - 4096):  # it is full in the midst of this or that part of the file
+    (run / "else").unlink(missing_ok=True)
+    (run / "else").write_bytes(bytes(shutil.disk_usage(run).free - room))
+    try:
+        save_checkpoint(run, at(2), CONFIG, "shards")
+    except DiskFull as error:
+        print(error)
+    print(read_checkpoint(run)["step"], sorted(path.name for path in (run / "checkpoints").iterdir()))
+"""
+
+
+def test_a_disk_that_is_really_full_keeps_the_checkpoint_before(tmp_path: Path) -> None:
+    mount = 'mount -t tmpfs -o size=16m none "$1"'
+    command = ["unshare", "--mount", "--map-root-user", "sh", "-euc"]
+    path = os.pathsep.join([str(Path(__file__).parent), str(Path(__file__).parents[2])])
+    environment = {**os.environ, "PYTHONPATH": path}
+    try:
+        allowed = subprocess.run([*command, mount, "sh", tmp_path], capture_output=True).returncode == 0
+    except FileNotFoundError:
+        allowed = False
+    if not allowed:
+        pytest.skip("mounting a file system of its own is not allowed here")
+    script = f'{mount}; "$2" -c "$3" "$1"'
+    answer = subprocess.run(
+        [*command, script, "sh", tmp_path, sys.executable, ON_A_FULL_DISK],
+        capture_output=True, text=True, env=environment,
+    )  # fmt: skip
+    assert answer.returncode == 0, answer.stderr
+    lines = answer.stdout.splitlines()
+    assert len(lines) == 10
+    for said, left in zip(lines[::2], lines[1::2], strict=True):
+        assert "step-00000002.pt: no space left on the disk; nothing that was there before is lost" in said
+        assert left == "1 ['latest', 'step-00000001.pt', 'step-00000001.pt.sha256']"
 
 
 def test_no_checkpoint_there(tmp_path: Path) -> None:
@@ -184,7 +369,7 @@ def test_other_settings_are_refused_and_all_named(run: Path) -> None:
 
 
 def test_settings_that_do_not_change_the_result_may_differ(run: Path) -> None:
-    other = replace(CONFIG, log_every=99, data=replace(CONFIG.data, workers=7))
+    other = replace(CONFIG, log=LogConfig(every=99, pictures=0), data=replace(CONFIG.data, workers=7))
     resume(run, new_state(other, ALONE), other, "shards")
 
 

@@ -1,10 +1,13 @@
+import json
 from pathlib import Path
 
 import pytest
 
+from dope import preset_files
 from dope.common.errors import UsageError
 from dope.common.settings import to_dict
-from dope.config import TrainConfig, differing_keys, load_config, preset_names
+from dope.config import TrainConfig, differing_keys, load_config
+from dope.preset_files import preset_names, preset_summary
 
 
 def test_the_defaults_and_the_paper_preset_are_the_papers() -> None:
@@ -18,10 +21,57 @@ def test_the_defaults_and_the_paper_preset_are_the_papers() -> None:
     assert (config.momentum, config.seed, config.pairs) == (0.999, 12345, "two_views")
 
 
-def test_every_preset_resolves() -> None:
-    assert preset_names() == ["nano", "paper"]
+def test_every_preset_resolves_and_says_what_it_is() -> None:
+    papers = ["paper", "paper_abc", "paper_co3d", "paper_modelnet", "paper_shapenet"]
+    assert preset_names() == ["fast", "nano", *papers]
     for name in preset_names():
         load_config(name)
+        assert 20 < len(preset_summary(name)) < 80 and preset_summary(name).endswith(".")
+    assert all(load_config(name) == TrainConfig() for name in papers)
+
+
+@pytest.mark.parametrize("dataset", ["modelnet40", "shapenet55", "co3d"])
+def test_the_papers_presets_know_their_datasets(dataset: str) -> None:
+    table = preset_files.PRESETS.parent / f"splits/{dataset}_ls.json"
+    objects = sum(json.loads(table.read_text())["train"].values())
+    text = (preset_files.PRESETS / f"paper_{dataset.rstrip('0123456789')}.yaml").read_text()
+    assert f"{objects:,} " in text
+    assert f"{objects // 256} steps an epoch, {objects // 256 * 3000:,} in all" in text
+
+
+def test_the_fast_preset_says_only_what_differs() -> None:
+    fast, paper = load_config("fast"), load_config("paper")
+    assert (fast.network, fast.augmentation, fast.loss, fast.data) == (
+        paper.network, paper.augmentation, paper.loss, paper.data,
+    )  # fmt: skip
+    assert fast.schedule.per == "step" and fast.schedule.warmup_steps > 0 and fast.optimiser.lr > paper.optimiser.lr
+    policy = fast.checkpoint
+    assert policy.every_steps > 0 and policy.keep == 3 and policy.keep_best
+
+
+@pytest.fixture
+def presets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(preset_files, "PRESETS", tmp_path)
+    return tmp_path
+
+
+def test_a_preset_extends_another(presets: Path) -> None:
+    (presets / "base.yaml").write_text("data: {batch_size: 64, points: 8}\nmomentum: 0.5\n")
+    (presets / "middle.yaml").write_text("# In between.\nextends: base\ndata: {points: 9}\n")
+    (presets / "top.yaml").write_text("extends: middle\nmomentum: 0.6\n")
+    config = load_config("top")
+    assert (config.data.batch_size, config.data.points, config.momentum) == (64, 9, 0.6)
+    assert load_config("base").data.points == 8
+
+
+def test_presets_that_extend_in_a_circle_or_nothing_known_are_errors(presets: Path) -> None:
+    (presets / "one.yaml").write_text("extends: two\n")
+    (presets / "two.yaml").write_text("extends: one\n")
+    (presets / "three.yaml").write_text("extends: twoo\n")
+    with pytest.raises(UsageError, match=r"one\.yaml: extends itself \(one -> two -> one\)"):
+        load_config("one")
+    with pytest.raises(UsageError, match=r"three\.yaml: extends: unknown preset 'twoo' \(did you mean 'two'"):
+        load_config("three")
 
 
 def test_a_file_goes_over_the_preset_and_overrides_over_both(tmp_path: Path) -> None:
@@ -51,6 +101,10 @@ def test_a_file_goes_over_the_preset_and_overrides_over_both(tmp_path: Path) -> 
         (["network.projector=[]"], "network.projector: .* must be one or more widths"),
         (["augmentation.gamma=[0, 1]"], "augmentation.gamma: .* must be positive"),
         (["augmentation.noise=500"], r"must lie in \[0, 256\]"),
+        (["checkpoint.every_steps=-1"], "checkpoint.every_steps: '-1' must not be negative"),
+        (["checkpoint.keep_best=true", "validation.every=0"], "checkpoint.keep_best: 'True' needs validation.every"),
+        (["log.every=0"], "log.every: '0' must be at least 1"),
+        (["log.pictures=-1"], "log.pictures: '-1' must not be negative"),
     ],
 )
 def test_wrong_settings_are_named(overrides: list[str], message: str) -> None:
@@ -77,6 +131,8 @@ def test_an_unknown_key_in_a_file_names_the_file(tmp_path: Path) -> None:
 
 
 def test_only_what_changes_the_result_counts_as_a_difference() -> None:
-    ours = to_dict(load_config("paper", None, ["data.workers=1", "device=cpu", "checkpoint.keep=3", "momentum=0.9"]))
+    ours = to_dict(
+        load_config("paper", None, ["data.workers=1", "device=cpu", "log.every=3", "checkpoint.keep=3", "momentum=0.9"])
+    )
     assert differing_keys(ours, to_dict(TrainConfig())) == {"momentum": (0.9, 0.999)}
     assert differing_keys({"betas": (0.9, 0.99)}, {"betas": [0.9, 0.99]}) == {}

@@ -1,8 +1,10 @@
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import poisoned_rank
 import pytest
 import torch
 import two_ranks
@@ -96,7 +98,7 @@ def test_one_rank_asked_to_stop_stops_all(outcomes: dict[tuple[str, int], dict])
 def test_two_ranks_train_and_one_goes_on(shards: Path, tmp_path: Path) -> None:
     settings = [
         *two_ranks.SETTINGS, "data.batch_size=4", "data.pairs_per_object=1", "data.workers=1", "schedule.epochs=3",
-        "validation.every=1", "checkpoint.every=1", "log_every=1",
+        "validation.every=1", "checkpoint.every=1", "log.every=1",
     ]  # fmt: skip
     arguments = [argument for value in settings for argument in ("--set", value)]
     done = torchrun(
@@ -118,6 +120,19 @@ def test_two_ranks_train_and_one_goes_on(shards: Path, tmp_path: Path) -> None:
     assert result["status"] == "finished" and result["steps_of_this_call"] == 3
     assert [line["step"] for line in read_metrics(tmp_path, "step")] == [1, 2, 3, 4, 5, 6]
     assert load_network(tmp_path)[1]["step"] == 6
+
+
+@pytest.mark.parametrize("what", ["loss", "gradient"])
+def test_all_ranks_stop_together_where_one_is_not_finite(shards: Path, tmp_path: Path, what: str) -> None:
+    done = torchrun(str(Path(poisoned_rank.__file__)), what, str(shards), str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    said, kept = zip(*((tmp_path / f"said-{rank}.txt").read_text().splitlines() for rank in (0, 1)), strict=True)
+    assert said[0] == said[1] and f"the {'norm of the ' * (what == 'gradient')}{what} is nan at step 2" in said[0]
+    assert kept[0] == kept[1] and kept[0].startswith("True "), "the weights are those before the step, on both"
+    written = json.loads((tmp_path / "not_finite-2.json").read_text())
+    assert [sample["rank"] for sample in written["samples"]] == [0, 0, 1, 1]
+    assert len({sample["key"] for sample in written["samples"]}) == 4
+    assert all(sample["key"] in said[0] for sample in written["samples"])
 
 
 def test_devices() -> None:

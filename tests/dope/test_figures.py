@@ -11,12 +11,14 @@ from spheres import CoordinateNetwork, sphere_view
 from tiny_views import write_views
 from torch import Tensor
 
+from dope.batch import PairBatch
 from dope.common.errors import BadInput, UsageError
-from dope.figures import draw_figures, figure_for, from_shards
+from dope.figures import draw_figures, figure_for, from_shards, held_out
 from dope.figures.colouring import correspondence_colouring, nearest, position_colours, principal_components
 from dope.figures.drawing import MARK, Row, contact_sheet, dimmed, heat, over, put_marker, put_text, write_png
 from dope.figures.from_shards import evenly_spaced
 from dope.figures.heatmap import similarity_heatmap
+from dope.figures.held_out import held_out_sheet
 from dope.figures.maps import describe
 from dope.networks import DopeNetwork, NetworkConfig
 from dope.networks.untrained import untrained_network
@@ -247,3 +249,45 @@ def test_one_sequence_without_an_object_does_not_stop_the_others(
         for path in draw_figures(None, shards, tmp_path, views=2, limit=2):
             drawn.append(path.name)
     assert drawn == ["shape0_object0-colouring.png"]
+
+
+def sphere_pairs(spheres: list) -> PairBatch:  # type: ignore[type-arg]
+    """Views 0 and 1, twice; the point of the second pair is the sphere's middle, the first pair has none."""
+    images = [torch.from_numpy(photo).permute(2, 0, 1)[None].expand(2, -1, -1, -1) for photo, _, _ in spheres[:2]]
+    masks = [torch.from_numpy(mask)[None, None].expand(2, -1, -1, -1) for _, mask, _ in spheres[:2]]
+    front, rows, columns = seen_in_both(spheres, 1)
+    at = int(np.argmin((rows - 48) ** 2 + (columns - 48) ** 2))
+    row2, column2 = np.argwhere(front)[at]
+    points = torch.full((2, 3, 4), 5.0)
+    points[1, 1] = torch.tensor([columns[at] + 0.5, rows[at] + 0.5, column2 + 0.5, row2 + 0.5])
+    valid = torch.tensor([[False] * 3, [False, True, True]])
+    return PairBatch(*images, *masks, points, valid, torch.arange(2), ("no point", "mug-0001"))
+
+
+def test_the_sheet_of_held_out_pairs_shows_a_point_where_it_is_and_where_it_is_found(
+    spheres: list, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[Row] = []
+    monkeypatch.setattr(held_out, "contact_sheet", lambda rows, **_: shown.extend(rows) or "sheet")
+    marked: list[tuple[float, float]] = []
+    monkeypatch.setattr(held_out, "put_marker", lambda image, point: marked.append(point) or image)
+    batch = sphere_pairs(spheres)
+    assert held_out_sheet(CoordinateNetwork(), [batch], 4) == "sheet"
+    (row,) = shown
+    assert row.label.startswith("mug-0001\noff by ") and len(row.tiles) == len(held_out.COLUMNS)
+    query, truth, found = marked
+    assert query == pytest.approx(batch.points[1, 1, :2].tolist())
+    assert truth == pytest.approx(batch.points[1, 1, 2:].tolist())
+    assert np.hypot(found[0] - truth[0], found[1] - truth[1]) < 4 < np.hypot(*(np.subtract(query, truth)))
+    for tile, photo, mask in ((row.tiles[3], *spheres[0][:2]), (row.tiles[4], *spheres[1][:2])):
+        core = cv2.erode(mask.astype(np.uint8), np.ones((17, 17))) > 0
+        outside = cv2.dilate(mask.astype(np.uint8), np.ones((17, 17))) == 0
+        assert np.abs(tile[core].astype(int) - photo[core]).max() < 12 and (tile[outside] > 240).all()
+
+
+def test_as_many_held_out_pairs_as_asked_for_and_none_where_there_is_none(spheres: list) -> None:
+    batch = sphere_pairs(spheres)
+    sheets = [held_out_sheet(CoordinateNetwork(), [batch] * 3, n) for n in (1, 2)]
+    assert sheets[0] is not None and sheets[1] is not None
+    assert sheets[0].dtype == np.uint8 and sheets[1].shape[0] - sheets[0].shape[0] > 96
+    assert held_out_sheet(CoordinateNetwork(), [], 4) is None

@@ -1,3 +1,4 @@
+import contextlib
 import json
 import math
 import os
@@ -12,13 +13,13 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from tiny_runs import TINY, losses_of, tiny
 from tiny_shards import write_shards
 
-from dope import trainer
 from dope.augmentation import no_augmentation
 from dope.batch import PairBatch
 from dope.checkpoints import list_checkpoints, load_network
-from dope.common.errors import BadInput, DopeError, UsageError
+from dope.common.errors import BadInput, UsageError
 from dope.config import TrainConfig, load_config
 from dope.distributed import Ranks
 from dope.run_logging import read_metrics
@@ -28,11 +29,6 @@ from dope.streaming import PairDataset, collate
 from dope.trainer import train
 
 ALONE = Ranks(0, 1, torch.device("cpu"))
-TINY = [
-    "network.width=0.125", "network.pyramid=16", "network.projector=[16, 8]", "data.image_size=32", "data.points=8",
-    "data.batch_size=4", "data.pairs_per_object=1", "data.workers=0", "schedule.epochs=3", "validation.every=1",
-    "checkpoint.every=0", "log_every=1", "device=cpu",
-]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -43,14 +39,6 @@ def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def one_thread() -> None:
     torch.set_num_threads(1)
-
-
-def tiny(*overrides: str) -> TrainConfig:
-    return load_config("nano", None, [*TINY, *overrides])
-
-
-def losses_of(run: Path) -> list[float]:
-    return [line["loss"] for line in read_metrics(run, "step")]
 
 
 def test_a_run_leaves_all_that_it_promises(shards: Path, tmp_path: Path) -> None:
@@ -152,25 +140,6 @@ def test_damaged_shards_stop_before_the_first_step(shards: Path, tmp_path: Path)
     with pytest.raises(BadInput, match=r"train-000001\.tar: is cut off"):
         train(copy, tmp_path / "run", tiny())
     assert not (tmp_path / "run").exists()
-
-
-def test_a_loss_that_is_not_finite_stops_with_step_and_samples(
-    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    real = trainer.sample_batch
-
-    def poisoned(batch: object, config: TrainConfig, step: int, rank: int) -> object:
-        sampled = real(batch, config, step, rank)  # type: ignore[arg-type]
-        if step == 2:
-            sampled.views.images1[0, 0, 0, 0] = float("nan")
-        return sampled
-
-    monkeypatch.setattr(trainer, "sample_batch", poisoned)
-    with pytest.raises(DopeError, match=r"the loss is nan at step 2 .*object_00\d-000\d") as caught:
-        train(shards, tmp_path, tiny("validation.every=0"))
-    assert "optimiser.lr" in str(caught.value)
-    line = read_metrics(tmp_path, "not_finite")[0]
-    assert line["step"] == 2 and len(line["keys"]) == 4
 
 
 @pytest.mark.parametrize("pairs", ["two_views", "one_view_twice"])
@@ -299,7 +268,10 @@ def test_learning_rates() -> None:
 
 
 @pytest.mark.timeout(180)
-@pytest.mark.parametrize(("number", "processes"), [(signal.SIGTERM, 1), (signal.SIGINT, 1), (signal.SIGINT, 2)])
+@pytest.mark.parametrize(
+    ("number", "processes"),
+    [(signal.SIGTERM, 1), (signal.SIGINT, 1), (signal.SIGINT, 2), (signal.SIGUSR1, 1), (signal.SIGUSR1, 2)],
+)
 def test_a_signal_writes_a_checkpoint_and_exits_with_75(
     shards: Path, tmp_path: Path, number: int, processes: int
 ) -> None:
@@ -319,11 +291,19 @@ def test_a_signal_writes_a_checkpoint_and_exits_with_75(
             if len(read_metrics(tmp_path, "step")) > 2 or process.poll() is not None:
                 break
             time.sleep(0.1)
-        os.killpg(process.pid, number)  # to the loader's workers too, as a batch system does
-        _, errors = process.communicate(timeout=60)
+        job = descendants(process.pid)
+        if number == signal.SIGUSR1:  # Slurm sends it to every process of the job, torchrun and workers included
+            for pid in (process.pid, *job):
+                os.kill(pid, number)
+        else:
+            os.killpg(process.pid, number)  # to the loader's workers too, as a batch system does
+        process.wait(timeout=60)
+        left = [pid for pid in job if is_training(pid)]
+        errors = process.communicate()[1]
     finally:
         process.terminate()
     assert process.returncode == 75, errors
+    assert not left, "it ended before the ranks had done so, perhaps before the checkpoint was written"
     assert processes > 1 or "Traceback" not in errors  # torchrun itself prints one
     steps = [line["step"] for line in read_metrics(tmp_path, "step")]
     assert [path.name for path in list_checkpoints(tmp_path)] == [f"step-{steps[-1]:08d}.pt"]
@@ -336,7 +316,7 @@ def test_it_learns(tmp_path: Path) -> None:
     settings = [
         "network.width=0.25", "network.pyramid=32", "network.projector=[64, 32]", "data.image_size=64",
         "data.points=16", "data.batch_size=16", "data.workers=0", "schedule.epochs=15", "validation.every=0",
-        "checkpoint.every=0", "log_every=1", "optimiser.lr=3e-3", "device=cpu", "validation.every=100",
+        "checkpoint.every=0", "log.every=1", "optimiser.lr=3e-3", "device=cpu", "validation.every=100",
         "augmentation.colour_p=0.2", "augmentation.geometry=false",
     ]  # fmt: skip
     result = train(shards, tmp_path / "run", load_config("nano", None, settings))
@@ -354,6 +334,26 @@ def one_step(shards: Path, config: TrainConfig) -> tuple[TrainState, StepLosses]
     state = new_state(config, ALONE)
     sampled = sample_batch(batch_of(shards, config), config, step=0, rank=0)
     return state, compute_losses(wrap(state.network, ALONE), state.momentum, sampled, config, ALONE)
+
+
+def descendants(pid: int) -> list[int]:
+    """The processes that a process started, those that they started, and so on."""
+    children: dict[int, list[int]] = {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):  # ended meanwhile
+            children.setdefault(int(stat.read_text().rpartition(")")[2].split()[1]), []).append(int(stat.parent.name))
+    found = list(children.get(pid, ()))
+    for child in found:
+        found += children.get(child, ())
+    return found
+
+
+def is_training(pid: int) -> bool:
+    """Whether a process of `dope train` still runs; torchrun's watchers and zombies do not count."""
+    with contextlib.suppress(OSError):
+        zombie = (Path("/proc") / str(pid) / "stat").read_text().rpartition(")")[2].split()[0] == "Z"
+        return not zombie and b"cli\0train" in (Path("/proc") / str(pid) / "cmdline").read_bytes()
+    return False
 
 
 def environment() -> dict[str, str]:
