@@ -262,13 +262,19 @@ def _name(path: Path) -> str:
 def _with_unique_ids(sources: list[Source], known: Mapping[Path, str]) -> list[Source]:
     """Prefix parents' names until no two ids are equal on any file system, then the file type, then a number.
 
-    Known sources keep their ids, and nobody else gets one of those.
+    Ids depend on the sources given and on what WORK held before them, not on how far their own preparation came: a
+    run that goes on, or a container that starts late, gives the ids that the first one gave. Known sources keep their
+    ids, and nobody else gets one of those.
     """
-    there = [source for source in sources if source.path.resolve() in known]
-    new = [source for source in sources if source.path.resolve() not in known]
-    named = iter(_unique([*new], {name.casefold() for name in known.values()}))
-    kept = iter(replace(source, id=known[source.path.resolve()]) for source in there)
-    return [next(kept) if source.path.resolve() in known else next(named) for source in sources]
+    places = [source.path.resolve() for source in sources]
+    others = {name.casefold() for place, name in known.items() if place not in set(places)}
+    named = [
+        replace(source, id=known.get(place, source.id))
+        for source, place in zip(_unique([*sources], others), places, strict=True)
+    ]
+    new = [source for source, place in zip(named, places, strict=True) if place not in known]
+    renamed = iter(_unique(new, {name.casefold() for name in known.values()}))
+    return [source if place in known else next(renamed) for source, place in zip(named, places, strict=True)]
 
 
 def _unique(sources: list[Source], reserved: set[str]) -> list[Source]:
