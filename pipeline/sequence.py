@@ -193,7 +193,14 @@ class Sequence:
         return self.folder / "stages"
 
     def read_info(self) -> SequenceInfo:
-        values = files.read_json(self.folder / "sequence.json")
+        """Raises `BadInput` where sequence.json is absent, or is none: no object, or without id, source or kind."""
+        path = self.folder / "sequence.json"
+        values = files.read_json(path)
+        remedy = "Prepare the sequence again with --overwrite"
+        if not isinstance(values, dict):
+            raise BadInput("is not a JSON object", where=path, remedy=remedy)
+        if missing := [key for key in ("id", "source", "kind") if not isinstance(values.get(key), str)]:
+            raise BadInput(f"does not say its {', '.join(missing)}", where=path, remedy=remedy)
         known = {f.name for f in fields(SequenceInfo)}
         return SequenceInfo(**{key: value for key, value in values.items() if key in known})
 

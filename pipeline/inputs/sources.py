@@ -138,7 +138,7 @@ def known_sources(work: Path) -> dict[Path, str]:
     for sequence in find_sequences(work) if work.is_dir() else ():
         try:
             source = Path(sequence.read_info().source)
-        except (BadInput, TypeError):
+        except BadInput:
             continue  # a damaged sequence.json is written anew
         if source.exists():
             known[source.resolve()] = sequence.id
