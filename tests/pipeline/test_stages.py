@@ -104,6 +104,7 @@ def test_a_damaged_marker_counts_as_none(sequence: Sequence, text: str) -> None:
     work = Work()
     run_stage(sequence, "sfm", Config(), "a", work)
     stages.marker_path(sequence, "sfm").write_text(text)
+    assert read_marker(sequence, "sfm") is None
     run_stage(sequence, "sfm", Config(), "a", work)
     assert work.calls == 2
 
