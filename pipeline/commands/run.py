@@ -124,6 +124,9 @@ def run(
     Settings have the stages' sections: frames, sfm, depth, masks, views, pairs, match, shards (`prep masks --set
     threshold=0.3` is --set masks.threshold=0.3 here). In an array job, the part that ends last writes the shards.
 
+    Without INPUT, frames, cameras and depth stay as they are: their settings are refused, and --overwrite makes masks,
+    correspondences and shards anew.
+
     Examples:
 
       dope prep run videos/ --category-from parent --out work --shards shards
@@ -149,6 +152,12 @@ def run(
         "shards.holdout": holdout,
     }
     resolved = resolve_config(RunConfig, config, flags, set_)
+    if not inputs:
+        _refuse_without_input(
+            resolved,
+            {"--category": category, "--category-from": None if category_from == "none" else category_from}
+            | {"--masks": masks, "--reuse-cameras": reuse_cameras, "--depths": depths},
+        )
     share = find_share(shard_index, num_shards)
     options = run_options(workers, threads, minutes, memory_gib, overwrite, retry_failed)
     if shards is not None:
@@ -167,6 +176,24 @@ def run(
     raise typer.Exit(exit_code(rows) if complete else 1)
 
 
+def _refuse_without_input(config: RunConfig, options: dict[str, str | None]) -> None:
+    """Raise `UsageError` for what has no effect on sequences that WORK holds already: whoever gives it means it."""
+    from dope.common import settings
+    from dope.common.errors import UsageError
+    from pipeline.prepare import COLMAP_STAGES
+    from pipeline.run import RunConfig
+
+    given, default = settings.to_dict(config), settings.to_dict(RunConfig())
+    names = [option for option, value in options.items() if value is not None]
+    for stage in COLMAP_STAGES:
+        names += [f"{stage}.{key}" for key, value in given[stage].items() if value != default[stage][key]]
+    if names:
+        raise UsageError(
+            f"without INPUT, frames, cameras and depth stay as they are: {', '.join(names)} would have no effect",
+            remedy="Name the videos or photo folders, or leave these settings out",
+        )
+
+
 def _items(
     inputs: list[Path],
     out: Path,
@@ -176,14 +203,11 @@ def _items(
     masks_from: str | None,
 ) -> tuple[list[Item], list[SourceError]]:
     """The sequences of the run, in all parts of an array job, and the inputs that cannot be used."""
-    from dope.common.errors import UsageError
     from pipeline.inputs.sources import find_sources, known_sources
     from pipeline.masks.places import find_masks
     from pipeline.run import items_of
     from pipeline.sequence import find_sequences
 
-    if not inputs and (given := next((name for name, value in beside.items() if value), None)):
-        raise UsageError(f"{given} come with an INPUT, and none was given", remedy="Name the videos or photo folders")
     sources, errors = find_sources(
         inputs, category=category, category_from=category_from, known=known_sources(out), **beside
     )

@@ -217,6 +217,22 @@ def test_a_place_for_shards_that_is_taken_is_refused_before_any_work(tmp_path: P
     assert "nowhere" in answer.output and "no sequence has correspondences" in str(answer.exception)
 
 
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--count", "30", "--set", "depth.agreement.tolerance=0.1"], "frames.count, depth.agreement"),
+        (["--mask-features"], "sfm.mask_features"),
+        (["--category", "mug"], "--category"),
+        (["--category-from", "parent", "--depths", "{}/depths"], "--category-from, --depths"),
+    ],
+)
+def test_what_has_no_effect_without_an_input_is_refused(tmp_path: Path, words: list[str], named: str) -> None:
+    ant = known(tmp_path / "w", "ant")
+    answer = prep_run("--out", tmp_path / "w", *words)
+    assert isinstance(answer.exception, UsageError) and f"as they are: {named} would have no" in str(answer.exception)
+    assert read_marker(ant, "masks") is None
+
+
 def test_the_part_that_ends_last_writes_the_shards(tmp_path: Path) -> None:
     work, shards = tmp_path / "w", tmp_path / "s"
     for name in ("ant", "bee", "cat"):
