@@ -157,7 +157,8 @@ def test_a_stage_of_a_newer_version_is_run_again_and_all_after_it(
 ) -> None:
     items = items_of(sources[:1], [], {}, tmp_path / "w")
     run_all(items, CONFIG, HERE)
-    monkeypatch.setitem(prepare.stages.STAGE_VERSIONS, "depth", 2)
+    versions = prepare.stages.STAGE_VERSIONS
+    monkeypatch.setitem(versions, "depth", versions["depth"] + 1)
     ran = [row.stage for row in run_all(items, CONFIG, HERE) if not row.skipped]
     assert ran == ["depth", "correspond"]
     assert fingerprint("depth", None, None) != fingerprint("masks", None, None)
