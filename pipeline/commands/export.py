@@ -32,10 +32,10 @@ def export(
     """Cameras, masks and points of prepared sequences in the formats of other tools.
 
     transforms writes transforms.json (and points.ply) as nerfstudio and its relatives read it; colmap-text writes the
-    model into the folder sparse_text. Cameras are in the
-    sequence's frame: the object in the origin, its radius the unit of length. What is written can be read back with
-    `dope prep colmap --reuse-cameras`. A sequence that another command works on is refused. COLMAP's own tools open each WORK/<sequence> as it is: `cd` there and
-    `colmap gui --project_path project.ini`, then import sparse/ as a model.
+    model into the folder sparse_text. Cameras are in the sequence's frame: the object in the origin, its radius the
+    unit of length. What is written can be read back with `dope prep colmap --reuse-cameras`. A sequence that another
+    command works on is refused. COLMAP's own tools open each WORK/<sequence> as it is: `cd` there and `colmap gui
+    --project_path project.ini`, then import sparse/ as a model.
 
     Examples:
 

@@ -155,9 +155,8 @@ def test_a_lock_on_another_disk_is_not_taken_for_the_sequences(
 
     monkeypatch.setattr(os, "stat", stat)
     place = device.format(major=8, minor=1, other=2)
-    (tmp_path / "locks").write_text(
-        f"1: POSIX  ADVISORY  WRITE 99 08:01:{inode} 0 EOF\n2: {waiting}FLOCK  ADVISORY  WRITE 99 {place}:{inode} 0 EOF\n"
-    )
+    lines = (f"1: POSIX  ADVISORY  WRITE 99 08:01:{inode}", f"2: {waiting}FLOCK  ADVISORY  WRITE 99 {place}:{inode}")
+    (tmp_path / "locks").write_text("".join(f"{line} 0 EOF\n" for line in lines))
     held = held_files(str(tmp_path / "locks"))
     monkeypatch.setattr(status_table, "held_files", lambda: held)
     assert (only_row(tmp_path)["status"] == "running") is running
