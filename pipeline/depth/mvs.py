@@ -57,7 +57,7 @@ class DepthConfig:
     """How depth maps made by other tools are read (`--depths`)."""
     fused: bool = False
     """PatchMatch also writes fused.ply: coloured points with normals on which several views agree."""
-    threads: int = 1
+    threads: int = settings.by_flag("--threads", 1)
     """Threads of OpenCV. The result is the same with any number."""
 
     def __post_init__(self) -> None:

@@ -234,6 +234,15 @@ def test_what_has_no_effect_without_an_input_is_refused(tmp_path: Path, words: l
     assert read_marker(ant, "masks") is None
 
 
+@pytest.mark.parametrize("setting", ["sfm.threads", "depth.threads"])
+def test_threads_are_a_flag_and_no_setting(tmp_path: Path, setting: str) -> None:
+    stage = setting.partition(".")[0]
+    (tmp_path / "threads.yaml").write_text(f"{stage}:\n  threads: 2\n")
+    for words in (["--set", f"{setting}=2"], ["--config", tmp_path / "threads.yaml"]):
+        answer = prep_run(tmp_path, "--out", tmp_path / "w", *words)
+        assert isinstance(answer.exception, UsageError) and "Use --threads" in str(answer.exception)
+
+
 def test_the_part_that_ends_last_writes_the_shards(tmp_path: Path) -> None:
     work, shards = tmp_path / "w", tmp_path / "s"
     for name in ("ant", "bee", "cat"):
