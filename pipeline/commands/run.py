@@ -139,6 +139,7 @@ def run(
     from pipeline.engines import find_share, interrupted_by_sigterm
     from pipeline.inputs.sources import input_errors_as_rows
     from pipeline.masks.places import is_shared
+    from pipeline.refused import keep_refused
     from pipeline.run import RunConfig, run_all
     from pipeline.shards.dataset import check_output
 
@@ -170,7 +171,13 @@ def run(
         resolved = replace(resolved, masks=replace(resolved.masks, shared=resolved.masks.shared or one_for_all))
         with Display(len(mine), "prep run").showing() as display:
             rows = run_all(mine, resolved, options, display)
-        rows += input_errors_as_rows(errors) if share.index == 0 else []
+        unusable = input_errors_as_rows(errors)
+        first = share.index == 0  # tells what belongs to no part of an array job
+        rows += unusable if first else []
+        if inputs:
+            others = {item.folder.name for item in items} - {item.folder.name for item in mine}
+            others |= set() if first else {row.sequence for row in unusable}
+            keep_refused(out, rows, elsewhere=others)
         show_rows(rows, as_json=as_json)
         complete = shards is None or _pack(items, out, shards, resolved, share, overwrite=overwrite, as_json=as_json)
     raise typer.Exit(exit_code(rows) if complete else 1)

@@ -19,6 +19,7 @@ from typing import Any, Literal
 from dope.common import files
 from dope.common.errors import BadInput, UsageError, legible
 from pipeline.inputs.photos import PHOTO_SUFFIXES, UNSUPPORTED_PHOTOS, list_photos, natural_order
+from pipeline.refused import refused
 from pipeline.sequence import find_sequences, sequence_id
 from pipeline.stages import StageResult
 
@@ -147,7 +148,7 @@ def known_sources(work: Path) -> dict[Path, str]:
 
 def input_errors_as_rows(errors: Iterable[SourceError]) -> list[StageResult]:
     """Inputs that cannot be used, as failed rows of the first stage."""
-    return [StageResult(name, "frames", "failed", reason=str(error)) for name, _path, error in errors]
+    return [refused(name, "frames", str(error)) for name, _path, error in errors]
 
 
 def source_fingerprint(source: Source) -> dict[str, Any]:

@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 from dope.common import files
 from dope.common.errors import BadInput
 from pipeline.engines import default_workers
-from pipeline.report.status_row import SCHEMA, sequence_row
+from pipeline.report.status_row import SCHEMA, refused_row, sequence_row
 
 BATCH = 2000
 """Sequences that become columns at a time: a row as a dict takes thirty times the memory of its place in a column."""
@@ -47,7 +47,7 @@ def read_status(places: list[Path], progress: Progress | None = None) -> pa.Tabl
 
 
 def read_work(work: Path, progress: Progress) -> pa.Table:
-    """The rows of one WORK folder, by id."""
+    """The rows of one WORK folder, by id: its sequences, and the inputs that could not be begun."""
     held = held_files()
     try:
         with os.scandir(work) as entries:
@@ -62,7 +62,11 @@ def read_work(work: Path, progress: Progress) -> pa.Table:
         tables.append(table)
         done += len(batch)
         progress("sequences", done, len(items))
-    return pa.concat_tables([SCHEMA.empty_table(), *tables])
+    table = pa.concat_tables([SCHEMA.empty_table(), *tables])
+    refused = [refused_row(str(work), path.stem) for path in sorted(work.glob(".refused/[!.]*.json"))]
+    if not refused:
+        return table
+    return pa.concat_tables([table, pa.Table.from_pylist(refused, SCHEMA)]).sort_by("id")
 
 
 def read_parquet(path: Path) -> pa.Table:
