@@ -89,11 +89,15 @@ class Run:
 
 
 def film(out: Path, sequences: int) -> None:
-    """Film the first `sequences` objects of both families in turn."""
+    """Film the first `sequences` objects of both families in turn; the first of each has the same file name, 0.avi."""
     per_family = -(-sequences // len(FAMILIES))
     film_objects(out, DemoConfig(FAMILIES, (), per_family=per_family, containers=("avi",), film=FILM))
     for video in sorted(out.glob("*/*.avi"), key=lambda path: (path.stem.rpartition("_")[2], path.stem))[sequences:]:
         video.unlink()
+    firsts = [out / family / f"{family}_0.avi" for family in FAMILIES]
+    if all(video.is_file() for video in firsts):
+        for video in firsts:  # whose id is that of its masks again: <family>_0
+            video.replace(video.with_name("0.avi"))
 
 
 def main() -> int:

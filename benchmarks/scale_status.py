@@ -1,10 +1,13 @@
-"""100,000 prepared sequences through status and merge, measured: one JSON line a figure.
+"""100,000 prepared sequences through status, merge and the planning of shards, measured: one JSON line a figure.
 
     python -m benchmarks.scale_status --out /tmp/dope-scale --count 100000
 
 Writes folders with the small JSON files of finished, failed and half-done sequences (kept for the next run), reads
-their status, writes and merges ten Parquet files of it, and filters the result. Each step runs in a process of its own;
-seconds are wall-clock and CPU (with child processes), memory is the peak of the largest process.
+their status, writes and merges ten Parquet files of it, filters the result, reads the markers once more and plans
+shards. Each step runs in a process of its own, and `all` is status, merge and shards in one process, one figure.
+Seconds are wall-clock and CPU (with child processes); `peak_memory_mib` is the peak of the largest process, and
+`peak_memory_sum_mib` the sum of the peaks of all, parent and pool. Finished sequences share one folder of views and its
+tables by links, or 100,000 would be millions of files.
 """
 
 from __future__ import annotations
@@ -19,6 +22,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from benchmarks.memory import PeakMemory
 
 STAGES = ("frames", "sfm", "depth", "masks", "correspond")
 CATEGORIES = ("apple", "bench", "cup", "hydrant", "teddybear")
@@ -46,6 +51,16 @@ def details_of(stage: str, rng: random.Random) -> dict[str, Any]:
 
 def make(work: Path, count: int) -> None:
     """Write the sequences that are not there yet: of each hundred, three failed in sfm and two wait for masks."""
+    from benchmarks.scale import write_folders
+    from pipeline.sequence import find_sequences
+    from pipeline.stages import read_marker
+
+    shared = work.parent / "shared"
+    if not shared.is_dir():
+        write_folders(shared, 1, views=34, pairs=64)
+    (model,) = find_sequences(shared)
+    marker_of_model = read_marker(model, "correspond")
+    assert marker_of_model is not None
     for i in range(count):
         folder, rng = work / f"sequence_{i:06d}", random.Random(i)
         if (folder / "sequence.json").exists():
@@ -56,6 +71,8 @@ def make(work: Path, count: int) -> None:
             marker = {"sequence": folder.name, "stage": stage, "status": "ok", "reason": None, "seconds": 12.345,
                       "cpu_seconds": 11.234, "peak_memory_mib": 230.4, "details": details_of(stage, rng),
                       "fingerprint": "942281e0ecd03b5e", "trace": None, "versions": {"dope": "0.1.0"}}  # fmt: skip
+            if stage == "correspond":
+                marker["details"] |= marker_of_model.details
             if done == 2 and stage == "sfm":
                 reason = f"{folder}: only {i % 7 + 3} of 100 frames register. Take more views"
                 marker |= {"status": "failed", "reason": reason, "details": {}}
@@ -64,6 +81,10 @@ def make(work: Path, count: int) -> None:
                 "instance": folder.name, "licence": None, "unit": "object radius", "ordered": True, "n_frames": 100,
                 "n_registered": 95, "registered_share": 0.95, "attempts": [details_of("sfm", rng)],
                 "masks_from": "grabcut"}  # fmt: skip
+        if done == 5:
+            for name in ("views", "views.parquet", "correspondences.parquet"):
+                (folder / name).unlink(missing_ok=True)
+                (folder / name).symlink_to((model.folder / name).absolute())
         (folder / "sequence.json").write_text(json.dumps(info, indent=1))
 
 
@@ -94,19 +115,44 @@ def table(out: Path) -> dict[str, Any]:
     return {"lines": sum(1 for _ in lines_of(read_status([out / "all.parquet"])))}
 
 
-STEPS: dict[str, Callable[[Path], dict[str, Any]]] = {"status": status, "merge": merge, "table": table}
+def shards(out: Path) -> dict[str, Any]:
+    from dope.common.settings import config_hash
+    from pipeline.sequence import find_sequences
+    from pipeline.shards.catalogue import read_catalogue
+    from pipeline.shards.plan import ShardsConfig, plan_tars
+
+    catalogue, marks, left_out = read_catalogue(find_sequences(out / "work"))
+    config_hash({"sequences": marks, "left_out": left_out})
+    plan, _ = plan_tars(catalogue, ShardsConfig())
+    return {"packed": len(catalogue), "left_out": len(left_out), "tars": len(plan)}
+
+
+def everything(out: Path) -> dict[str, Any]:
+    return {**status(out), **merge(out), **shards(out)}
+
+
+STEPS: dict[str, Callable[[Path], dict[str, Any]]] = {
+    "status": status,
+    "merge": merge,
+    "table": table,
+    "shards": shards,
+    "all": everything,
+}
 
 
 def measure(step: str, out: Path) -> None:
     start, before = time.perf_counter(), time.process_time()
-    result = STEPS[step](out)
-    own, children = resource.getrusage(resource.RUSAGE_SELF), resource.getrusage(resource.RUSAGE_CHILDREN)
+    with PeakMemory() as memory:
+        result = STEPS[step](out)
+    children = resource.getrusage(resource.RUSAGE_CHILDREN)
     values = {
         "step": step,
         **result,
         "seconds": round(time.perf_counter() - start, 2),
         "cpu_seconds": round(time.process_time() - before + children.ru_utime + children.ru_stime, 2),
-        "peak_memory_mib": round(max(own.ru_maxrss, children.ru_maxrss) / 1024, 1),
+        "peak_memory_mib": memory.largest_mib,
+        "peak_memory_sum_mib": memory.sum_mib,
+        "processes": len(memory.peaks_kib),
     }
     print(json.dumps(values), flush=True)
 

@@ -102,7 +102,7 @@ def other_input(sequence: Sequence, source: Source) -> str | None:
     """Why a source must not take the place of what WORK/<id> holds: another input, still there, has the same name."""
     try:
         before = Path(sequence.read_info().source)
-    except (BadInput, TypeError):
+    except BadInput:
         return None
     if not before.exists() or before.samefile(source.path):
         return None

@@ -181,6 +181,6 @@ def _held(sequence: Sequence) -> list[StageResult]:
 def _how_to_begin(sequence: Sequence) -> str:
     try:
         kind = sequence.read_info().kind
-    except (BadInput, TypeError):
+    except BadInput:
         kind = ""
     return f"Run {'`dope prep co3d`' if kind == 'co3d' else 'the same command with its INPUT'} again"

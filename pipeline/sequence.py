@@ -64,6 +64,10 @@ FRAME_SCHEMA = pa.schema(
 )
 
 
+FARTHEST = 13.0
+"""Depth that is kept, in multiples of the depth of what the view looks at: a step is 0.02% of that at most."""
+
+
 @dataclass
 class Frame:
     """One row of frames.parquet. Dropped frames keep their row, with a reason and no image."""
@@ -193,7 +197,14 @@ class Sequence:
         return self.folder / "stages"
 
     def read_info(self) -> SequenceInfo:
-        values = files.read_json(self.folder / "sequence.json")
+        """Raises `BadInput` where sequence.json is absent, or is none: no object, or without id, source or kind."""
+        path = self.folder / "sequence.json"
+        values = files.read_json(path)
+        remedy = "Prepare the sequence again with --overwrite"
+        if not isinstance(values, dict):
+            raise BadInput("is not a JSON object", where=path, remedy=remedy)
+        if missing := [key for key in ("id", "source", "kind") if not isinstance(values.get(key), str)]:
+            raise BadInput(f"does not say its {', '.join(missing)}", where=path, remedy=remedy)
         known = {f.name for f in fields(SequenceInfo)}
         return SequenceInfo(**{key: value for key, value in values.items() if key in known})
 
@@ -239,13 +250,27 @@ class Sequence:
         frame.mask = f"masks/{frame.frame:06d}.png"
         write_image(self.folder / frame.mask, mask.astype(np.uint8) * 255)
 
-    def write_depth(self, frame: Frame, depth: NDArray[np.floating]) -> None:
-        """Write z-depth (h, w) as 16-bit PNG; one step is 1/65535 of the largest depth (the caller writes frames)."""
+    def write_depth(
+        self, frame: Frame, depth: NDArray[np.floating], *, subject: float | None = None
+    ) -> NDArray[np.float32]:
+        """Write z-depth (h, w) as 16-bit PNG and return it as it is read back (the caller writes the frames).
+
+        One step is 1/65535 of the largest depth. So that a sky at 1e10 leaves steps for what is near, depth of more
+        than `FARTHEST` times the subject's becomes unknown, as is what is no positive finite number.
+
+        Args:
+            subject: depth of what the view looks at; None: the median of the map.
+        """
+        known = np.where(np.isfinite(depth) & (depth > 0), depth, 0.0)
+        if subject is None:
+            subject = float(np.median(known[known > 0])) if known.any() else 0.0
+        known[known > FARTHEST * subject] = 0
+        largest = float(known.max(initial=0.0))
         frame.depth = f"depths/{frame.frame:06d}.png"
-        largest = float(np.nanmax(depth, initial=0.0))
         frame.depth_scale = largest / 65535 if largest > 0 else 1.0
-        values = np.nan_to_num(depth / frame.depth_scale, nan=0.0, posinf=0.0, neginf=0.0)
-        write_image(self.folder / frame.depth, np.clip(np.rint(values), 0, 65535).astype(np.uint16))
+        values = np.rint(known / frame.depth_scale).astype(np.uint16)
+        write_image(self.folder / frame.depth, values)
+        return values.astype(np.float32) * np.float32(frame.depth_scale)
 
     def _read(self, name: str | None, flags: int) -> NDArray[Any]:
         if name is None:

@@ -78,9 +78,10 @@ def read_marker(sequence: Sequence, stage: str) -> StageResult | None:
         return None
     try:
         values = files.read_json(path)
-        return StageResult(**{k: v for k, v in values.items() if k in StageResult.__dataclass_fields__})
+        marker = StageResult(**{k: v for k, v in values.items() if k in StageResult.__dataclass_fields__})
     except (BadInput, TypeError, AttributeError):
         return None
+    return marker if isinstance(marker.details, dict) else None
 
 
 def require(sequence: Sequence, stage: str, command: str) -> StageResult:

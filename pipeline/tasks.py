@@ -11,6 +11,7 @@ from dope.common.errors import DiskFull, DopeError
 from pipeline import stages
 from pipeline.children import ChildFailed, ChildStopped, Limits, run_in_child
 from pipeline.engines import holding, run_items
+from pipeline.refused import refused
 from pipeline.sequence import Sequence
 from pipeline.stages import StageResult
 
@@ -67,7 +68,7 @@ def run_tasks(tasks: list[Task], options: RunOptions, watcher: Watcher) -> list[
     def one(task: Task) -> list[StageResult]:
         rows = already_done(task, options)
         if rows is None and task.refusal is not None:
-            rows = [_failed(task.folder, task.stages[0], task.refusal)]
+            rows = [refused(task.folder.name, task.stages[0], task.refusal)]
         if rows is None:
             watcher.started(task.folder.name)
             rows = _in_child(task, options, watcher)

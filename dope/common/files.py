@@ -67,15 +67,22 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 
 
 def replace_folder(new: Path, path: Path) -> None:
-    """Put the folder `new` in the place of `path`, which may exist; on failure `path` is what it was."""
+    """Put the folder `new` in the place of `path`, which may exist; on failure `path` is what it was.
+
+    Raises:
+        BadInput: `path` is a mount point, or on another disk than `new`.
+    """
     old = path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY}.old")
     try:
         if path.exists():
             path.replace(old)  # two renames: the moment without either folder does not grow with its size
         new.replace(path)
-    except BaseException:
+    except BaseException as error:
         if old.exists() and not path.exists():
             old.replace(path)
+        if isinstance(error, OSError) and error.errno in (errno.EBUSY, errno.EXDEV):  # e.g. a volume of a container
+            what = f"cannot be replaced as a whole: is it a mount point? ({error.strerror})"
+            raise BadInput(what, where=path, remedy="Name a folder inside it") from error
         raise
     shutil.rmtree(old, ignore_errors=True)
 

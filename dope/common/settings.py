@@ -23,6 +23,15 @@ from dope.common.errors import UsageError
 Config = TypeVar("Config")
 
 
+FLAG = "flag"
+
+
+def by_flag(flag: str, default: Any) -> Any:
+    """A field of a config class that says how the work is done, not what comes out: a flag of the command sets it when
+    the work begins. No setting may name it, so it is its default wherever a fingerprint is taken."""
+    return dataclasses.field(default=default, metadata={FLAG: flag})
+
+
 def to_dict(config: Any) -> dict[str, Any]:
     """A config as plain nested dicts, in the order of its fields."""
     return dataclasses.asdict(config)
@@ -41,11 +50,9 @@ def from_mapping(cls: type[Config], values: Mapping[str, Any], *, where: str = "
         UsageError: an unknown key (the closest known one is named) or a value of the wrong type.
     """
     hints = typing.get_type_hints(cls)
-    known = {field.name for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
     arguments: dict[str, Any] = {}
     for key, value in values.items():
-        if key not in known:
-            raise UsageError(_unknown(str(key), known), where=where)
+        _require_setting(cls, str(key), where)
         arguments[key] = _convert(hints[key], value, f"{where}: {key}")
     return cls(**arguments)
 
@@ -96,6 +103,17 @@ def load_yaml(path: Path) -> dict[str, Any]:
     return values
 
 
+def _require_setting(cls: type, key: str, where: str) -> None:
+    """Raise `UsageError` for what is no field of a config class, or a field that only a flag sets (`by_flag`)."""
+    fields = {field.name: field for field in dataclasses.fields(cls)}
+    known = [name for name, field in fields.items() if FLAG not in field.metadata]
+    if key not in fields:
+        raise UsageError(_unknown(key, known), where=where)
+    if key not in known:
+        flag = fields[key].metadata[FLAG]
+        raise UsageError(f"'{key}' is no setting: {flag} sets it", where=where, remedy=f"Use {flag}")
+
+
 def _unknown(key: str, known: Iterable[str]) -> str:
     close = difflib.get_close_matches(key, list(known), n=1)
     hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(sorted(known))}"
@@ -103,9 +121,7 @@ def _unknown(key: str, known: Iterable[str]) -> str:
 
 
 def _replace(config: Any, path: list[str], value: Any, where: str) -> Any:
-    known = {field.name for field in dataclasses.fields(config)}
-    if path[0] not in known:
-        raise UsageError(_unknown(path[0], known), where=where)
+    _require_setting(type(config), path[0], where)
     if len(path) == 1:
         hint = typing.get_type_hints(type(config))[path[0]]
         return dataclasses.replace(config, **{path[0]: _convert(hint, value, where)})

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from dope.common.errors import UsageError
+from dope.common.settings import by_flag
 from pipeline.cameras.intrinsics import CameraModel, check_intrinsics
 from pipeline.cameras.model_checks import CheckConfig
 
@@ -73,7 +74,7 @@ class SfmConfig:
     the cameras (matches where none came); or none at all, which costs nothing and checks nothing."""
     keep_database: bool = True
     """Leave COLMAP's database (features, matches, two-view geometries) and project.ini in the sequence, for its GUI."""
-    threads: int = 1
+    threads: int = by_flag("--threads", 1)
     """Threads of COLMAP; with one the same input gives the same bytes."""
     seed: int = 0
     """Seed of all random sampling."""

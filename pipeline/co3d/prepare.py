@@ -102,7 +102,7 @@ def _other_input(sequence: Sequence, source: Co3dSource) -> str | None:
         before = Path(sequence.read_info().source)
         if not before.exists() or before.samefile(source.path):
             return None
-    except (BadInput, TypeError, OSError, ValueError):
+    except (BadInput, OSError, ValueError):
         return None
     remedy = "Choose another --out, or delete that folder"
     return str(BadInput(f"{sequence.folder} holds the sequence of {before} already", where=source.path, remedy=remedy))

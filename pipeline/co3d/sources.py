@@ -14,6 +14,7 @@ from dope.common.errors import BadInput
 from pipeline.co3d.annotations import FrameAnnotation, SequenceAnnotation
 from pipeline.co3d.index import FILE_COLUMNS, CategoryIndex, IndexedSequence, Row, frame_of, open_index
 from pipeline.co3d.tree import Category, Members, NoSuchSet, find_categories, is_inside
+from pipeline.refused import refused
 from pipeline.sequence import sequence_id
 from pipeline.stages import StageResult
 
@@ -229,8 +230,9 @@ def _fault(category: Category, file: str, row: int, what: str) -> str:
 
 
 def _row(name: str, status: str, reason: str, given: str | None = None) -> StageResult:
-    details = {"name": given} if given is not None else {}
-    return StageResult(name, "frames", "failed" if status == "failed" else "empty", reason=reason, details=details)
+    row = refused(name, "frames", reason) if status == "failed" else StageResult(name, "frames", "empty", reason=reason)
+    row.details |= {"name": given} if given is not None else {}
+    return row
 
 
 def _size(source: Co3dSource, path: str | None) -> int | None:

@@ -149,6 +149,7 @@ def co3d(
     from pipeline.co3d.sources import Choice, find_co3d
     from pipeline.console import Display, exit_code, show_rows
     from pipeline.engines import find_share
+    from pipeline.refused import keep_refused
 
     flags: dict[str, Any] = {
         "frames.every": every,
@@ -175,5 +176,7 @@ def co3d(
         rows = prepare_co3d(mine, out, resolved, options, display)
     first = share.index == 0  # what belongs to no part of an array job is told by the first
     rows += failed if first else []
+    others = {source.id for source in sources} - {source.id for source in mine}
+    keep_refused(out, rows, elsewhere=others | (set() if first else {row.sequence for row in failed}))
     show_rows([*rows, *(left_out if first else [])], as_json=as_json)
     raise typer.Exit(exit_code(rows))

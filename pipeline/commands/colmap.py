@@ -134,6 +134,7 @@ def colmap(
     from pipeline.engines import find_share
     from pipeline.inputs.sources import find_sources, input_errors_as_rows, known_sources
     from pipeline.prepare import ColmapConfig, prepare
+    from pipeline.refused import keep_refused
 
     flags: dict[str, Any] = {
         "frames.every": every,
@@ -161,6 +162,11 @@ def colmap(
     mine = share.of(sources)
     with Display(len(mine), "prep colmap").showing() as display:
         rows = prepare(mine, out, resolved, options, display)
-    rows += input_errors_as_rows(errors) if share.index == 0 else []
+    unusable = input_errors_as_rows(errors)
+    first = share.index == 0  # tells what belongs to no part of an array job
+    rows += unusable if first else []
+    others = {source.id for source in sources} - {source.id for source in mine}
+    others |= set() if first else {row.sequence for row in unusable}
+    keep_refused(out, rows, elsewhere=others)
     show_rows(rows, as_json=as_json)
     raise typer.Exit(exit_code(rows))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -30,10 +32,10 @@ def export(
     """Cameras, masks and points of prepared sequences in the formats of other tools.
 
     transforms writes transforms.json (and points.ply) as nerfstudio and its relatives read it; colmap-text writes the
-    model into the folder sparse_text. Cameras are in the
-    sequence's frame: the object in the origin, its radius the unit of length. What is written can be read back with
-    `dope prep colmap --reuse-cameras`. COLMAP's own tools open each WORK/<sequence> as it is: `cd` there and
-    `colmap gui --project_path project.ini`, then import sparse/ as a model.
+    model into the folder sparse_text. Cameras are in the sequence's frame: the object in the origin, its radius the
+    unit of length. What is written can be read back with `dope prep colmap --reuse-cameras`. A sequence that another
+    command works on is refused. COLMAP's own tools open each WORK/<sequence> as it is: `cd` there and `colmap gui
+    --project_path project.ini`, then import sparse/ as a model.
 
     Examples:
 
@@ -45,6 +47,7 @@ def export(
     """
     from dope.common.errors import DiskFull, DopeError, UsageError
     from pipeline.cameras.export import export_sequence
+    from pipeline.engines import holding
 
     if format not in ("transforms", "colmap-text"):
         raise UsageError(f"'{format}' is not one of transforms, colmap-text", where="--format")
@@ -53,7 +56,9 @@ def export(
     failed = 0
     for sequence in chosen_sequences(work, only):
         try:
-            done = export_sequence(sequence, format, out and out / sequence.id, depths=depths)  # type: ignore[arg-type]
+            # what may only be read has no writer here, and needs no lock
+            with holding(sequence.folder) if os.access(sequence.folder, os.W_OK) else nullcontext():
+                done = export_sequence(sequence, format, out and out / sequence.id, depths=depths)  # type: ignore[arg-type]
         except DiskFull:
             raise
         except DopeError as error:

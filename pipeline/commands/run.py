@@ -124,6 +124,9 @@ def run(
     Settings have the stages' sections: frames, sfm, depth, masks, views, pairs, match, shards (`prep masks --set
     threshold=0.3` is --set masks.threshold=0.3 here). In an array job, the part that ends last writes the shards.
 
+    Without INPUT, frames, cameras and depth stay as they are: their settings are refused, and --overwrite makes masks,
+    correspondences and shards anew.
+
     Examples:
 
       dope prep run videos/ --category-from parent --out work --shards shards
@@ -136,6 +139,7 @@ def run(
     from pipeline.engines import find_share, interrupted_by_sigterm
     from pipeline.inputs.sources import input_errors_as_rows
     from pipeline.masks.places import is_shared
+    from pipeline.refused import keep_refused
     from pipeline.run import RunConfig, run_all
     from pipeline.shards.dataset import check_output
 
@@ -149,6 +153,12 @@ def run(
         "shards.holdout": holdout,
     }
     resolved = resolve_config(RunConfig, config, flags, set_)
+    if not inputs:
+        _refuse_without_input(
+            resolved,
+            {"--category": category, "--category-from": None if category_from == "none" else category_from}
+            | {"--masks": masks, "--reuse-cameras": reuse_cameras, "--depths": depths},
+        )
     share = find_share(shard_index, num_shards)
     options = run_options(workers, threads, minutes, memory_gib, overwrite, retry_failed)
     if shards is not None:
@@ -161,10 +171,34 @@ def run(
         resolved = replace(resolved, masks=replace(resolved.masks, shared=resolved.masks.shared or one_for_all))
         with Display(len(mine), "prep run").showing() as display:
             rows = run_all(mine, resolved, options, display)
-        rows += input_errors_as_rows(errors) if share.index == 0 else []
+        unusable = input_errors_as_rows(errors)
+        first = share.index == 0  # tells what belongs to no part of an array job
+        rows += unusable if first else []
+        if inputs:
+            others = {item.folder.name for item in items} - {item.folder.name for item in mine}
+            others |= set() if first else {row.sequence for row in unusable}
+            keep_refused(out, rows, elsewhere=others)
         show_rows(rows, as_json=as_json)
         complete = shards is None or _pack(items, out, shards, resolved, share, overwrite=overwrite, as_json=as_json)
     raise typer.Exit(exit_code(rows) if complete else 1)
+
+
+def _refuse_without_input(config: RunConfig, options: dict[str, str | None]) -> None:
+    """Raise `UsageError` for what has no effect on sequences that WORK holds already: whoever gives it means it."""
+    from dope.common import settings
+    from dope.common.errors import UsageError
+    from pipeline.prepare import COLMAP_STAGES
+    from pipeline.run import RunConfig
+
+    given, default = settings.to_dict(config), settings.to_dict(RunConfig())
+    names = [option for option, value in options.items() if value is not None]
+    for stage in COLMAP_STAGES:
+        names += [f"{stage}.{key}" for key, value in given[stage].items() if value != default[stage][key]]
+    if names:
+        raise UsageError(
+            f"without INPUT, frames, cameras and depth stay as they are: {', '.join(names)} would have no effect",
+            remedy="Name the videos or photo folders, or leave these settings out",
+        )
 
 
 def _items(
@@ -176,14 +210,11 @@ def _items(
     masks_from: str | None,
 ) -> tuple[list[Item], list[SourceError]]:
     """The sequences of the run, in all parts of an array job, and the inputs that cannot be used."""
-    from dope.common.errors import UsageError
     from pipeline.inputs.sources import find_sources, known_sources
     from pipeline.masks.places import find_masks
     from pipeline.run import items_of
     from pipeline.sequence import find_sequences
 
-    if not inputs and (given := next((name for name, value in beside.items() if value), None)):
-        raise UsageError(f"{given} come with an INPUT, and none was given", remedy="Name the videos or photo folders")
     sources, errors = find_sources(
         inputs,
         category=category,

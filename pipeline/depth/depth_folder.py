@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from dope.common.errors import BadInput
+from pipeline.depth.depth_filter import sample_pixels
 from pipeline.depth.mvs import DepthConfig, working_size
 from pipeline.depth.readers import READERS, read_depth_file
 from pipeline.depth.resample import distortion_px, redistorted, reduced
@@ -18,6 +19,8 @@ from pipeline.inputs.photos import natural_order, read_orientation, turn_upright
 from pipeline.sequence import Frame, Sequence
 
 NEGLIGIBLE_PX = 0.5  # lens distortion that moves no pixel of a depth map farther than this
+TELLING_FRAMES = 8  # frames whose sparse points tell how the files of a folder lie
+CLEARLY = 0.7  # the median error of the right way is less than this share of the other's
 AFFIX = re.compile(r"^depth[_-]|[_.-](depth|geometric|photometric)$", re.IGNORECASE)
 
 
@@ -25,11 +28,12 @@ class FolderDepths:
     """Depth maps of a folder, one file a frame.
 
     A file belongs to a photo `IMG_1.jpg` as `IMG_1.png`, `IMG_1.jpg.png`, `IMG_1_depth.exr` or COLMAP's
-    `IMG_1.jpg.geometric.bin`, and to a video's frame by the last number in its name, the frame's number from 0. It is
-    upright, or lies as the photo's pixels do before its EXIF orientation is applied. COLMAP's arrays belong to
-    undistorted images: in their workspace (stereo/depth_maps beside sparse/) they are distorted again as its model
-    says, elsewhere they are refused where the photos' distortion makes a difference. Of several files for one frame,
-    the first of COLMAP's geometric, EXR, NPY, NPZ, TIFF, PNG, COLMAP's photometric is taken.
+    `IMG_1.jpg.geometric.bin`, and to a video's frame by the last number in its name, the frame's number from 0. They
+    are upright, or lie as the photos' pixels do before the EXIF orientation is applied: where the shape does not tell
+    (half a turn, mirrored, square), the way that agrees with the sparse points is taken for all files. COLMAP's arrays
+    belong to undistorted images: in their workspace (stereo/depth_maps beside sparse/) they are distorted again as its
+    model says, elsewhere they are refused where the photos' distortion makes a difference. Of several files for one
+    frame, the first of COLMAP's geometric, EXR, NPY, NPZ, TIFF, PNG, COLMAP's photometric is taken.
 
     Raises:
         BadInput: no such folder, or no file belongs to any frame.
@@ -37,6 +41,8 @@ class FolderDepths:
 
     def __init__(self, sequence: Sequence, folder: Path, config: DepthConfig) -> None:
         self.folder, self._config, self._long_side = folder, config.imported, config.long_side
+        self._sequence, self._min_track = sequence, config.min_track
+        self._as_stored: bool | None = None
         self.unit: Literal["cameras", "unknown", "auto"] = config.imported.unit
         info = sequence.read_info()
         self._photos = Path(info.source)
@@ -93,10 +99,62 @@ class FolderDepths:
 
     def _upright(self, depth: Depth, frame: Frame) -> Depth:
         height, width = depth.shape
-        if (width > height) == (frame.width > frame.height):
+        orientation = self._orientation(frame)
+        if orientation == 1:
             return depth
+        if orientation >= 5 and height != width:  # sides change places, which the shape shows
+            same = (width > height) == (frame.width > frame.height)
+            return depth if same else turn_upright(depth, orientation)
+        if self._as_stored is None:
+            self._as_stored = self._lie_as_stored()
+        return turn_upright(depth, orientation) if self._as_stored else depth
+
+    def _orientation(self, frame: Frame) -> int:
+        """Of a photo's EXIF; 1 where it is no JPEG, or is not there any more."""
         photo = self._photos / frame.source_name
-        return turn_upright(depth, read_orientation(photo))
+        return read_orientation(photo)
+
+    def _lie_as_stored(self) -> bool:
+        """Whether the files lie as the photos' pixels do, by the depth of sparse points read from them either way.
+
+        Raises:
+            BadInput: the points do not tell, since there are too few or both ways fit them alike.
+        """
+        from pipeline.cameras import colmap
+
+        tracks = colmap.read_points(self._sequence).longer_than(self._min_track)
+        upright, turned = [np.zeros(0)], [np.zeros(0)]
+        read = 0
+        for frame in self._frames:
+            path, orientation = self._paths.get(frame.frame), self._orientation(frame)
+            if path is None or orientation == 1 or read == TELLING_FRAMES:
+                continue
+            try:
+                depth = read_depth_file(path).values
+            except BadInput:  # told when its turn comes
+                continue
+            other = turn_upright(depth, orientation)
+            if other.shape != depth.shape:
+                continue
+            read += 1
+            pixels, z = frame.camera.resized(depth.shape[1], depth.shape[0]).project(tracks.seen_by(frame.frame))
+            seen = np.stack([sample_pixels(values, pixels) for values in (depth, other)])
+            both = (np.isfinite(seen) & (seen > 0)).all(axis=0) & (z > 0)
+            if both.any():
+                ratios = np.log(seen[:, both] / z[both])
+                off = np.abs(ratios - np.median(ratios, axis=1, keepdims=True))
+                upright.append(off[0])
+                turned.append(off[1])
+        errors = [np.concatenate(parts) for parts in (upright, turned)]
+        if len(errors[0]) >= self._config.min_points:
+            as_upright, as_stored = (float(np.median(error)) for error in errors)
+            if min(as_upright, as_stored) < CLEARLY * max(as_upright, as_stored):
+                return as_stored < as_upright
+        raise BadInput(
+            f"{len(errors[0])} sparse points do not tell whether the depth maps are turned by the photos' EXIF",
+            where=self.folder,
+            remedy="Turn photos and depth maps upright, and remove the orientation from the photos' EXIF",
+        )
 
 
 def match_depth_files(frames: list[Frame], folder: Path, *, by_number: bool) -> dict[int, Path]:

@@ -17,7 +17,16 @@ from pipeline.cameras.sparse_points import Tracks
 from pipeline.depth.depth_filter import drop_contradicted, sample_pixels
 from pipeline.depth.depth_folder import FolderDepths, has_shape_of
 from pipeline.depth.import_scale import ImportConfig, Scale, find_scale
-from pipeline.depth.mvs import DepthConfig, clear_depths, describe, load_view, looked_at, object_centre, opencv_threads
+from pipeline.depth.mvs import (
+    DepthConfig,
+    clear_depths,
+    describe,
+    load_view,
+    looked_at,
+    object_centre,
+    opencv_threads,
+    store_depths,
+)
 from pipeline.depth.neighbours import choose_neighbours
 from pipeline.depth.resample import reduced
 from pipeline.depth.stereo import Depth, View
@@ -79,11 +88,9 @@ def import_depths(sequence: Sequence, source: DepthSource, config: DepthConfig) 
             witnesses_of = choose_neighbours(cameras, targets, config.witnesses)
             depths, shares = drop_contradicted(cameras, depths, witnesses_of, config.agreement)
     clear_depths(sequence, frames)
-    for frame, depth in zip(registered, depths, strict=True):
-        if depth is not None:
-            sequence.write_depth(frame, depth)
+    stored = store_depths(sequence, registered, views, depths)
     sequence.write_frames(frames)
-    details = describe(registered, views, depths, tracks)
+    details = describe(registered, views, depths, stored, tracks)
     details["method"] = "imported"
     known = scale.factors[np.isfinite(scale.factors)]
     details["scale"], details["scale_from"] = float(np.median(known)), scale.method

@@ -57,7 +57,7 @@ class DepthConfig:
     """How depth maps made by other tools are read (`--depths`)."""
     fused: bool = False
     """PatchMatch also writes fused.ply: coloured points with normals on which several views agree."""
-    threads: int = 1
+    threads: int = settings.by_flag("--threads", 1)
     """Threads of OpenCV. The result is the same with any number."""
 
     def __post_init__(self) -> None:
@@ -108,16 +108,36 @@ def write_depths(sequence: Sequence, tracks: Tracks, config: DepthConfig, method
         masked = not sequence.read_info().masks_are_later
         views = [load_view(sequence, frame, long_tracks, config, masked=masked) for frame in registered]
         depths = method(sequence, registered, views, tracks, config)
-    for frame, depth in zip(registered, depths, strict=True):
-        if depth is not None:
-            sequence.write_depth(frame, depth)
+    stored = store_depths(sequence, registered, views, depths)
     sequence.write_frames(frames)
-    details = describe(registered, views, depths, long_tracks)
+    details = describe(registered, views, depths, stored, long_tracks)
     details["method"] = method.__name__
     details["cpu_seconds_per_frame"] = round((time.process_time() - started) / len(registered), 3)
-    if not details["frames_with_depth"]:
+    if not details["frames_with_depth"] and all(depth is None for depth in depths):
         details["empty"] = "no frame has a neighbour at a usable angle"
     return details
+
+
+def store_depths(
+    sequence: Sequence, frames: list[Frame], views: list[View], depths: list[Depth | None]
+) -> list[Depth | None]:
+    """Write depth maps (the caller writes the frames) and return them as they are read back.
+
+    None where a frame has none, or a map without any depth that can be kept: no file is written of those.
+    """
+    targets = looked_at(views, object_centre(sequence, views))
+    stored: list[Depth | None] = []
+    for frame, view, target, depth in zip(frames, views, targets, depths, strict=True):
+        if depth is None or not depth.any():
+            stored.append(None)
+            continue
+        z = float(view.camera.R[2] @ target + view.camera.t[2])  # NaN where it is not known what the view looks at
+        kept = sequence.write_depth(frame, depth, subject=z if z > 0 else None)
+        if not kept.any():
+            (sequence.folder / str(frame.depth)).unlink()
+            frame.depth = frame.depth_scale = None
+        stored.append(kept if kept.any() else None)
+    return stored
 
 
 @contextmanager
@@ -268,33 +288,44 @@ def sparse_depth(
     return depths
 
 
-def describe(frames: list[Frame], views: list[View], depths: list[Depth | None], tracks: Tracks) -> dict[str, Any]:
-    """Coverage of the depth maps and their agreement with the sparse points, as JSON values.
+def describe(
+    frames: list[Frame], views: list[View], given: list[Depth | None], stored: list[Depth | None], tracks: Tracks
+) -> dict[str, Any]:
+    """Coverage of the stored depth maps and their agreement with the sparse points, as JSON values.
 
-    `coverage` is the share of all pixels with depth, `mask_coverage` that of the pixels in (slightly grown) masks.
+    `coverage` is the share of all pixels with depth, `mask_coverage` that of the pixels in (slightly grown) masks;
+    `too_far_share` is the share of the given depth that was too far to be stored, where there is any. Where no frame
+    has depth, `empty` says so.
     """
     coverage: list[float] = []
     mask_coverage: list[float] = []
-    errors: list[Floats] = []
-    for frame, view, depth in zip(frames, views, depths, strict=True):
+    errors: list[Floats] = [np.zeros(0)]
+    for frame, view, depth in zip(frames, views, stored, strict=True):
+        inside = view.region is not None and view.region.any()
         if depth is None:
             coverage.append(0.0)
+            mask_coverage += [0.0] if inside else []
             continue
         coverage.append(float((depth > 0).mean()))
-        if view.region is not None and view.region.any():
-            mask_coverage.append(float((depth[view.region] > 0).mean()))
+        mask_coverage += [float((depth[view.region] > 0).mean())] if inside else []
         pixels, z = view.camera.project(tracks.seen_by(frame.frame))
         seen = sample_pixels(depth, pixels)
         both = (seen > 0) & (z > 0)
         errors.append(np.abs(seen[both] / z[both] - 1))
-    error = np.concatenate(errors) if errors else np.zeros(0)
+    error = np.concatenate(errors)
+    without = [f.frame for f, depth in zip(frames, stored, strict=True) if depth is None]
     details: dict[str, Any] = {
-        "frames_with_depth": sum(depth is not None for depth in depths),
-        "frames_without_depth": [f.frame for f, depth in zip(frames, depths, strict=True) if depth is None],
+        "frames_with_depth": len(frames) - len(without),
+        "frames_without_depth": without,
         "coverage": round(float(np.mean(coverage)), 4),
         "mask_coverage": round(float(np.mean(mask_coverage)), 4) if mask_coverage else None,
         "sparse_points_compared": len(error),
     }
+    there, kept = (sum(np.count_nonzero(d > 0) for d in maps if d is not None) for maps in (given, stored))
+    if kept < there:
+        details["too_far_share"] = round(float(1 - kept / there), 6)
+    if len(without) == len(frames):
+        details["empty"] = "no pixel of any frame has a depth that is believed"
     if len(error):
         details["sparse_median_error"] = round(float(np.median(error)), 5)
         details["sparse_within_1_percent"] = round(float((error < 0.01).mean()), 4)

@@ -23,6 +23,7 @@ from typing import Any, Literal
 from dope.common import files
 from dope.common.errors import BadInput, UsageError, legible
 from pipeline.inputs.photos import PHOTO_SUFFIXES, UNSUPPORTED_PHOTOS, list_photos, natural_order, unsupported_photos
+from pipeline.refused import refused
 from pipeline.sequence import find_sequences, sequence_id
 from pipeline.stages import StageResult
 
@@ -140,7 +141,7 @@ def known_sources(work: Path) -> dict[Path, str]:
     for sequence in find_sequences(work) if work.is_dir() else ():
         try:
             source = Path(sequence.read_info().source)
-        except (BadInput, TypeError):
+        except BadInput:
             continue  # a damaged sequence.json is written anew
         if source.exists():
             known[source.resolve()] = sequence.id
@@ -149,7 +150,7 @@ def known_sources(work: Path) -> dict[Path, str]:
 
 def input_errors_as_rows(errors: Iterable[SourceError]) -> list[StageResult]:
     """Inputs that cannot be used, as failed rows of the first stage."""
-    return [StageResult(name, "frames", "failed", reason=str(error)) for name, _path, error in errors]
+    return [refused(name, "frames", str(error)) for name, _path, error in errors]
 
 
 def source_fingerprint(source: Source) -> dict[str, Any]:
@@ -292,13 +293,19 @@ def _name(path: Path) -> str:
 def _with_unique_ids(sources: list[Source], known: Mapping[Path, str]) -> list[Source]:
     """Prefix parents' names until no two ids are equal on any file system, then the file type, then a number.
 
-    Known sources keep their ids, and nobody else gets one of those.
+    Ids depend on the sources given and on what WORK held before them, not on how far their own preparation came: a
+    run that goes on, or a container that starts late, gives the ids that the first one gave. Known sources keep their
+    ids, and nobody else gets one of those.
     """
-    there = [source for source in sources if source.path.resolve() in known]
-    new = [source for source in sources if source.path.resolve() not in known]
-    named = iter(_unique([*new], {name.casefold() for name in known.values()}))
-    kept = iter(replace(source, id=known[source.path.resolve()]) for source in there)
-    return [next(kept) if source.path.resolve() in known else next(named) for source in sources]
+    places = [source.path.resolve() for source in sources]
+    others = {name.casefold() for place, name in known.items() if place not in set(places)}
+    named = [
+        replace(source, id=known.get(place, source.id))
+        for source, place in zip(_unique([*sources], others), places, strict=True)
+    ]
+    new = [source for source, place in zip(named, places, strict=True) if place not in known]
+    renamed = iter(_unique(new, {name.casefold() for name in known.values()}))
+    return [source if place in known else next(renamed) for source, place in zip(named, places, strict=True)]
 
 
 def _unique(sources: list[Source], reserved: set[str]) -> list[Source]:

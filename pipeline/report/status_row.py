@@ -194,6 +194,18 @@ def sequence_row(work: str, name: str, *, running: bool = False) -> dict[str, An
     return row
 
 
+def refused_row(work: str, name: str) -> dict[str, Any]:
+    """The row of WORK/.refused/name.json: an input that could not be begun (see `pipeline.refused`)."""
+    row: dict[str, Any] = dict.fromkeys(NAMES)
+    row |= {"id": as_text(name), "work": as_text(work), "duplicate": False, "status": "failed", "stage": "frames"}
+    try:
+        note = read_object(f"{work}/.refused/{name}.json") or {}
+        row["reason"] = as_text(note.get("reason")) or "no reason given"
+    except Damaged as damage:
+        row["reason"] = f".refused/{name}.json {damage}"
+    return row
+
+
 def _add_info(row: dict[str, Any], info: dict[str, Any]) -> None:
     for key in ("kind", "category", "instance", "source", "masks_from"):
         row[key] = as_text(info.get(key))

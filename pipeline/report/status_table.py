@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from itertools import islice
@@ -18,7 +19,7 @@ import pyarrow.parquet as pq
 from dope.common import files
 from dope.common.errors import BadInput
 from pipeline.engines import default_workers
-from pipeline.report.status_row import SCHEMA, sequence_row
+from pipeline.report.status_row import SCHEMA, refused_row, sequence_row
 
 BATCH = 2000
 """Sequences that become columns at a time: a row as a dict takes thirty times the memory of its place in a column."""
@@ -46,8 +47,8 @@ def read_status(places: list[Path], progress: Progress | None = None) -> pa.Tabl
 
 
 def read_work(work: Path, progress: Progress) -> pa.Table:
-    """The rows of one WORK folder, by id."""
-    held = held_inodes()
+    """The rows of one WORK folder, by id: its sequences, and the inputs that could not be begun."""
+    held = held_files()
     try:
         with os.scandir(work) as entries:
             names = sorted(entry.name for entry in entries if not entry.name.startswith(".") and entry.is_dir())
@@ -61,7 +62,11 @@ def read_work(work: Path, progress: Progress) -> pa.Table:
         tables.append(table)
         done += len(batch)
         progress("sequences", done, len(items))
-    return pa.concat_tables([SCHEMA.empty_table(), *tables])
+    table = pa.concat_tables([SCHEMA.empty_table(), *tables])
+    refused = [refused_row(str(work), path.stem) for path in sorted(work.glob(".refused/[!.]*.json"))]
+    if not refused:
+        return table
+    return pa.concat_tables([table, pa.Table.from_pylist(refused, SCHEMA)]).sort_by("id")
 
 
 def read_parquet(path: Path) -> pa.Table:
@@ -109,24 +114,37 @@ def write_csv(table: pa.Table, path: Path) -> None:
         csv.write_csv(table, partial_path)
 
 
-def held_inodes(listing: str = "/proc/locks") -> frozenset[int]:
-    """Inodes of all files that a process of this machine holds by flock.
+Held = Mapping[int, set[tuple[int, int]]]
+"""Inodes of locked files, with the devices (major, minor) on which a file of that inode is locked."""
+
+
+def held_files(listing: str = "/proc/locks") -> Held:
+    """All files that a process of this machine holds by flock.
 
     Asking each lock file itself would mean taking it for a moment, in which a run that starts would give up. Where the
     system has no such list (macOS), or the process runs on another machine, a running sequence looks as it stands.
     """
+    held: dict[int, set[tuple[int, int]]] = defaultdict(set)
     try:
-        lines = Path(listing).read_text(encoding="ascii").splitlines()
-        return frozenset(int(line.split()[5].rpartition(":")[2]) for line in lines if " FLOCK " in line)
+        for line in Path(listing).read_text(encoding="ascii").splitlines():
+            _, flock, rest = line.partition(" FLOCK ")
+            if flock:  # ADVISORY WRITE <process> <major>:<minor>:<inode> <from> <to>
+                major, minor, inode = rest.split()[3].split(":")
+                held[int(inode)].add((int(major, 16), int(minor, 16)))
     except (OSError, ValueError, IndexError):
-        return frozenset()
+        return {}
+    return dict(held)
 
 
-def _is_held(path: str, held: frozenset[int]) -> bool:
+def _is_held(path: str, held: Held) -> bool:
+    """Anonymous devices (major 0: overlay, btrfs) have other numbers in the list than `stat` says: there, the inode
+    alone counts."""
     try:
-        return os.stat(path).st_ino in held  # noqa: PTH116 - 100,000 Paths are slow
+        found = os.stat(path)  # noqa: PTH116 - 100,000 Paths are slow
     except OSError:
         return False
+    own = os.major(found.st_dev), os.minor(found.st_dev)
+    return any(device == own or 0 in (device[0], own[0]) for device in held.get(found.st_ino, ()))
 
 
 def _read_batch(work: str, items: list[Item]) -> pa.Table:

@@ -18,12 +18,12 @@ from dope.common.errors import BadInput, UsageError
 from pipeline.engines import Share, holding_output
 from pipeline.sequence import Sequence
 from pipeline.shards.catalogue import read_catalogue
-from pipeline.shards.parts import write_part
+from pipeline.shards.parts import clear_parts, write_part
 from pipeline.shards.plan import ShardsConfig, TarPlan, plan_tars
 from pipeline.shards.writer import SCHEMAS, SequenceContents, WrittenShard, write_tar
 
 FORMAT = 1  # of the folder; a new number makes every dataset be written anew
-OURS = re.compile(r"(train|val|views)-\d{6}\.tar|index\.parquet|views\.parquet|dataset\.json|\.lock")
+OURS = re.compile(r"(train|val|views)-\d{6}\.tar|index\.parquet|views\.parquet|dataset\.json|\.lock|\..+\.partial.*")
 KEPT = 8192  # sequences whose tables stay in memory between their samples: rounds visit them in turn, some 100 MB
 ROWS = 1 << 20  # of a table that are written at once
 REDO = "Copy the shards again from where they came, or write them anew with `dope prep shards --overwrite`"
@@ -73,6 +73,7 @@ def write_shards(
         {"format": FORMAT, "config": settings.to_dict(config), "sequences": marks, "left_out": left_out}
     )
     if not overwrite and (there := _same_dataset(out, mark)):
+        clear_parts(out, mark)
         return {**there, "skipped": True}
     plan, details = plan_tars(catalogue, config)
     details["left_out"] = left_out
@@ -93,12 +94,15 @@ def write_shards(
 
     if share.count > 1:
         waiting_for = write_part(out, mark, plan, share, write, finish)
+        if not waiting_for:
+            clear_parts(out)
         return {**details, "skipped": False, "waiting_for": waiting_for}
     with holding_output(out, wait=wait):
         if not overwrite and (there := _same_dataset(out, mark)):  # written by the one that was waited for
             return {**there, "skipped": True}
         with files.atomic_folder(out) as folder:
             finish(folder, [write(folder / tar.name, tar) for tar in plan])
+        clear_parts(out)
     return {**details, "skipped": False}
 
 
@@ -189,6 +193,9 @@ def _check_folder(out: Path) -> None:
     """Writing replaces `out` as a whole: refuse to do so to anything that is not a dataset."""
     if out.exists() and not out.is_dir():
         raise UsageError("is a file, not a folder", where=out, remedy="Choose another --out")
+    if out.is_mount():
+        remedy = f"Name a folder inside it, e.g. {out / 'shards'}"
+        raise UsageError("is a mount point, and a dataset is replaced as a whole", where=out, remedy=remedy)
     foreign = sorted(path.name for path in out.iterdir() if not OURS.fullmatch(path.name)) if out.exists() else []
     if foreign:
         listed = ", ".join(foreign[:3]) + (" ..." if len(foreign) > 3 else "")

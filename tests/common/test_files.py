@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import errno
+import os
 import pickle
+from pathlib import Path
 
 import pytest
 
@@ -57,6 +59,21 @@ def test_what_killed_runs_left_is_cleared_and_what_they_replaced_comes_back(tmp_
     assert (tmp_path / "images/a.jpg").read_text() == "old"
 
 
+@pytest.mark.parametrize("code", [errno.EBUSY, errno.EXDEV])
+def test_a_folder_that_cannot_be_replaced_is_explained_and_stays(tmp_path, monkeypatch, code: int) -> None:
+    """What the kernel answers where the folder is a volume of a container."""
+    folder = tmp_path / "dataset"
+    folder.mkdir()
+
+    def busy(path: Path, _: Path) -> None:
+        raise OSError(code, os.strerror(code), str(path))
+
+    monkeypatch.setattr(Path, "replace", busy)
+    with pytest.raises(BadInput, match=r"dataset: .*mount point.*Name a folder inside it"), files.atomic_folder(folder):
+        pass
+    assert [p.name for p in tmp_path.iterdir()] == ["dataset"]
+
+
 def test_damaged_json_is_named(tmp_path) -> None:
     path = tmp_path / "marker.json"
     path.write_text('{"a": ')
@@ -68,8 +85,6 @@ def test_damaged_json_is_named(tmp_path) -> None:
 
 
 def test_quick_fingerprint_sees_content_but_not_the_time(tmp_path) -> None:
-    import os
-
     path = tmp_path / "v.bin"
     path.write_bytes(b"a" * 5_000_000)
     before = files.quick_fingerprint(path)

@@ -1,18 +1,17 @@
-"""Depth maps made by other tools: every format, unit and name, and files that lie."""
+"""Depth maps made by other tools brought into a sequence: every format, unit, size and name."""
 
 from __future__ import annotations
 
-import io
-import zipfile
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
+from depth_files import WRITERS, write_all
 from synthetic import Scene, orbit, pixel_centres, write_sequence
+from tiny_media import encode, with_orientation
 
+import pipeline.sequence
 from dope.common.errors import BadInput
 from pipeline.cameras import colmap
 from pipeline.cameras.sparse_points import SparsePoints
@@ -20,9 +19,9 @@ from pipeline.depth.depth_folder import match_depth_files
 from pipeline.depth.import_scale import ImportConfig
 from pipeline.depth.imported import import_depth_folder, import_depths
 from pipeline.depth.mvs import DepthConfig
-from pipeline.depth.readers import MAX_PIXELS, read_depth_file
 from pipeline.depth.resample import reduced
 from pipeline.geometry import Camera
+from pipeline.inputs.photos import turn_upright
 from pipeline.sequence import Frame, Sequence
 
 SCENE = Scene()
@@ -51,42 +50,6 @@ def sequence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Sequence:
     found.write_info(info)
     monkeypatch.setattr(colmap, "read_points", lambda _: sparse_points(CAMERAS))
     return found
-
-
-def write_png(path: Path, depth: np.ndarray) -> None:
-    path.write_bytes(cv2.imencode(".png", np.rint(np.nan_to_num(depth) * 1000).astype(np.uint16))[1].tobytes())
-
-
-def write_tiff(path: Path, depth: np.ndarray) -> None:
-    path.write_bytes(cv2.imencode(".tiff", depth.astype(np.float32))[1].tobytes())
-
-
-def write_exr(path: Path, depth: np.ndarray, channel: str = "Z") -> None:
-    exr = pytest.importorskip("OpenEXR")
-    with exr.File({"type": exr.scanlineimage}, {channel: depth.astype(np.float32)}) as file:
-        file.write(str(path))
-
-
-def write_bin(path: Path, depth: np.ndarray) -> None:
-    height, width = depth.shape
-    path.write_bytes(f"{width}&{height}&1&".encode() + depth.astype("<f4").tobytes())
-
-
-WRITERS: dict[str, Callable[[Path, np.ndarray], None]] = {
-    ".png": write_png,
-    ".tiff": write_tiff,
-    ".exr": write_exr,
-    ".npy": np.save,
-    ".npz": lambda path, depth: np.savez_compressed(path, depth=depth.astype(np.float16)),
-    ".jpg.geometric.bin": write_bin,
-}
-
-
-def write_all(folder: Path, depths: list[np.ndarray], suffix: str = ".npy") -> Path:
-    folder.mkdir(exist_ok=True)
-    for i, depth in enumerate(depths):
-        WRITERS[suffix](folder / f"{i:04d}{suffix}", depth)
-    return folder
 
 
 def errors_of(sequence: Sequence) -> np.ndarray:
@@ -179,6 +142,40 @@ def test_what_is_not_a_positive_number_is_unknown(sequence: Sequence, tmp_path: 
         assert not depth[row : row + 4].any() and depth[row + 4].any()
 
 
+@pytest.mark.parametrize("far", [1e10, 65504.0, 1e4, 300.0])
+@pytest.mark.parametrize("share", ["a corner", "all but the object"])
+def test_a_far_sky_takes_no_step_from_what_is_near(sequence: Sequence, tmp_path: Path, far: float, share: str) -> None:
+    """Blender's sky is at 1e10, and the largest half float is 65504; steps of 1/65535 of that would keep nothing."""
+    with_sky = [t / 2.5 for t in TRUTH]
+    for depth, camera in zip(with_sky, CAMERAS, strict=True):
+        if share == "a corner":
+            depth[:6, :6] = far
+        else:
+            depth[~SCENE.render(camera)[2]] = far
+    details = import_depth_folder(sequence, write_all(tmp_path / "d", with_sky), CONFIG)
+    for i, frame in enumerate(sequence.read_frames()):
+        depth = sequence.read_depth(frame)
+        near = (with_sky[i] > 0) & (with_sky[i] < far)
+        assert depth is not None and ((depth > 0) == near).all()
+        assert (np.abs(depth[near] / TRUTH[i][near] - 1) < 2e-4).all()
+    sky = sum(int((d == np.float32(far)).sum()) for d in with_sky) / sum(int((d > 0).sum()) for d in with_sky)
+    assert details["too_far_share"] == pytest.approx(sky, abs=0.02)  # other views look through some of it
+    assert details["sparse_within_1_percent"] > 0.95 and details["frames_with_depth"] == 7
+
+
+def test_depth_is_described_as_it_is_read_back(sequence: Sequence, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Given:
+        unit = "cameras"
+
+        def read(self, frame: Frame) -> np.ndarray:
+            return TRUTH[frame.frame] / np.float32(2.5)
+
+    monkeypatch.setattr(pipeline.sequence, "FARTHEST", 0.1)
+    details = import_depths(sequence, Given(), CONFIG)
+    assert details["frames_with_depth"] == 0 and details["coverage"] == 0 and details["too_far_share"] == 1
+    assert "empty" in details and all(frame.depth is None for frame in sequence.read_frames())
+
+
 def test_true_depth_that_no_other_view_sees_survives_the_check(sequence: Sequence, tmp_path: Path) -> None:
     object_only = [np.where(SCENE.render(c)[2], t, 0) / 2.5 for c, t in zip(CAMERAS, TRUTH, strict=True)]
     only_one = [TRUTH[0] / 2.5, *object_only[1:]]
@@ -202,6 +199,38 @@ def test_depth_that_others_look_through_is_removed_unless_the_check_is_off(seque
     import_depth_folder(sequence, folder, replace(CONFIG, imported=ImportConfig(check=False)))
     kept = sequence.read_depth(sequence.read_frames()[3])
     assert kept is not None and kept[place].all()
+
+
+def with_photos(sequence: Sequence, folder: Path, orientation: int) -> None:
+    """The photos that the sequence was made of, with an orientation in their EXIF."""
+    folder.mkdir()
+    for i in range(len(CAMERAS)):
+        (folder / f"{i:04d}.jpg").write_bytes(with_orientation(encode(np.zeros((8, 8, 3), np.uint8)), orientation))
+    info = sequence.read_info()
+    info.source = str(folder)
+    sequence.write_info(info)
+
+
+@pytest.mark.parametrize("lies", ["upright", "as stored"])
+@pytest.mark.parametrize("orientation", [2, 3, 4])
+def test_sparse_points_tell_how_depth_lies_where_its_shape_does_not(
+    sequence: Sequence, tmp_path: Path, orientation: int, lies: str
+) -> None:
+    with_photos(sequence, tmp_path / "photos", orientation)
+    maps = [t / 2.5 for t in TRUTH]
+    if lies == "as stored":  # these orientations undo themselves
+        maps = [turn_upright(depth, orientation) for depth in maps]
+    details = import_depth_folder(sequence, write_all(tmp_path / "d", maps), CONFIG)
+    assert details["frames_with_depth"] == 7 and np.median(errors_of(sequence)) < 1e-3
+
+
+def test_depth_that_may_lie_either_way_is_refused(
+    sequence: Sequence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with_photos(sequence, tmp_path / "photos", 3)
+    monkeypatch.setattr(colmap, "read_points", lambda _: sparse_points(CAMERAS, count=2))
+    with pytest.raises(BadInput, match=r"do not tell whether the depth maps are turned.*EXIF"):
+        import_depth_folder(sequence, write_all(tmp_path / "d", [t / 2.5 for t in TRUTH]), CONFIG)
 
 
 def test_depth_maps_are_matched_by_name_and_number(tmp_path: Path) -> None:
@@ -281,135 +310,6 @@ def test_colmap_arrays_of_distorted_photos_are_refused(tmp_path: Path, monkeypat
     monkeypatch.setattr(colmap, "read_points", lambda _: sparse_points(distorted))
     with pytest.raises(BadInput, match=r"undistorted image, which differs from '0000.jpg' by up to \d+\.\d px"):
         import_depth_folder(sequence, write_all(tmp_path / "d", TRUTH, ".jpg.geometric.bin"), CONFIG)
-
-
-def npz_of(**arrays: np.ndarray) -> bytes:
-    file = io.BytesIO()
-    np.savez_compressed(file, **arrays)
-    return file.getvalue()
-
-
-def npy_head(shape: tuple[int, ...], dtype: str = "<f4") -> bytes:
-    file = io.BytesIO()
-    np.lib.format.write_array_header_1_0(file, {"shape": shape, "fortran_order": False, "descr": dtype})
-    return file.getvalue()
-
-
-def npz_bomb() -> bytes:
-    """A member that claims, and truly is when unpacked, far more than a depth map."""
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("depth.npy", npy_head((60000, 60000)) + bytes(1 << 20))
-    return file.getvalue()
-
-
-def packed_by(method: int, name: str = "depth.npy") -> bytes:
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w", method) as archive:
-        archive.writestr(name, npy_head((6, 8)) + bytes(range(192)))
-    return file.getvalue()
-
-
-def damaged_lzma() -> bytes:
-    data = bytearray(packed_by(zipfile.ZIP_LZMA))
-    data[60:80] = bytes(20)
-    return bytes(data)
-
-
-GOOD = np.linspace(1, 2, 48, dtype=np.float32).reshape(6, 8)
-
-
-@pytest.mark.parametrize(
-    ("name", "data", "message"),
-    [
-        ("a.npy", b"", "is no NumPy array"),
-        ("a.npy", npy_head((6, 8)).replace(b"}", b"{") + bytes(192), "is no NumPy array"),
-        ("a.npy", npy_head((60000, 60000)), "claims too many numbers"),
-        ("a.npy", npy_head((6, 8)) + bytes(100), "is cut off"),
-        ("a.npy", npy_head((-6, -8)) + bytes(192), "."),
-        ("a.npy", npy_head((2, 3, 8, 1)) + bytes(192), "is no depth map: 2 x 3 x 8 x 1"),
-        ("a.npy", npy_head((6, 8), "<c8") + bytes(384), "is no depth map"),
-        ("a.npy", npy_head((6, 8), "|u1") + bytes(48), "8 bits"),
-        ("a.npy", npy_head((6, 8), "|O") + bytes(384), "Python objects"),
-        ("a.npz", npz_of(depth=GOOD)[:-30], "is no NPZ"),
-        ("a.npz", npz_of(rgb=GOOD, other=GOOD), "holds no array of depth, but other, rgb"),
-        ("a.npz", damaged_lzma(), "is no NPZ"),
-        ("a.npz", packed_by(zipfile.ZIP_STORED, "ä.npy").replace("ä".encode(), b"\xff\xff"), "is no NPZ"),
-        ("a.npz", npz_bomb(), "claims too many numbers"),
-        ("a.bin", b"60000&60000&1&" + bytes(64), "64 bytes for 60000 x 60000 x 1"),
-        ("a.bin", b"8&6&1&" + bytes(4 * 47), "is not a depth map of COLMAP"),
-        ("a.bin", b"-8&-6&1&" + bytes(4 * 48), "is not a depth map of COLMAP"),
-        ("a.bin", b"\xff\xd8\xff\xe0", "is not a depth map of COLMAP"),
-        ("a.png", cv2.imencode(".png", (GOOD * 100).astype(np.uint8))[1].tobytes(), "8 bits"),
-        ("a.png", cv2.imencode(".png", np.ones((6, 8, 3), np.uint16))[1].tobytes(), "6 x 8 x 3"),
-        ("a.png", cv2.imencode(".png", (GOOD * 100).astype(np.uint16))[1].tobytes()[:-20], "cut off"),
-        ("a.tiff", cv2.imencode(".tiff", GOOD)[1].tobytes()[:40], "decoded"),
-        ("a.tiff", b"not a tiff", "decoded"),
-        ("a.exr", b"not an exr", "is no EXR"),
-        ("a.xyz", b"", "is no kind of depth map"),
-    ],
-)
-def test_files_that_lie_are_refused_by_name(tmp_path: Path, name: str, data: bytes, message: str) -> None:
-    path = tmp_path / f"spaces & ü {name}"
-    path.write_bytes(data)
-    if name.endswith("exr"):
-        pytest.importorskip("OpenEXR")
-    with pytest.raises(BadInput, match=message) as caught:
-        read_depth_file(path)
-    assert caught.value.where == str(path)
-
-
-def test_a_png_that_claims_more_than_memory_is_refused(tmp_path: Path) -> None:
-    import struct
-    import zlib
-
-    data = cv2.imencode(".png", (GOOD * 100).astype(np.uint16))[1].tobytes()
-    head = b"IHDR" + struct.pack(">II", 60000, 60000) + data[24:29]
-    bomb = data[:12] + head + struct.pack(">I", zlib.crc32(head)) + data[33:]
-    (tmp_path / "bomb.png").write_bytes(bomb)
-    with pytest.raises(BadInput):
-        read_depth_file(tmp_path / "bomb.png")
-    assert MAX_PIXELS < 60000 * 60000
-
-
-@pytest.mark.parametrize("channel", ["Z", "depth", "V", "Y", "R", "distance"])
-def test_exr_channels_of_depth(tmp_path: Path, channel: str) -> None:
-    write_exr(tmp_path / "a.exr", GOOD, channel)
-    assert np.array_equal(read_depth_file(tmp_path / "a.exr").values, GOOD)
-
-
-def test_exr_that_is_cut_off_or_without_depth_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    exr = pytest.importorskip("OpenEXR")
-    write_exr(tmp_path / "a.exr", GOOD)
-    whole = (tmp_path / "a.exr").read_bytes()
-    (tmp_path / "a.exr").write_bytes(whole[:-60])
-    with pytest.raises(BadInput):
-        read_depth_file(tmp_path / "a.exr")
-    assert not capfd.readouterr().out
-    with exr.File({"type": exr.scanlineimage}, {"A": GOOD, "B": GOOD}) as file:
-        file.write(str(tmp_path / "b.exr"))
-    with pytest.raises(BadInput, match="no channel of depth, but A, B"):
-        read_depth_file(tmp_path / "b.exr")
-
-
-def test_exr_with_a_part_of_the_image_is_refused(tmp_path: Path) -> None:
-    exr = pytest.importorskip("OpenEXR")
-    whole = np.array([0, 0], np.int32), np.array([20, 20], np.int32)
-    part = np.array([3, 2], np.int32), np.array([10, 7], np.int32)
-    header = {"type": exr.scanlineimage, "displayWindow": whole, "dataWindow": part}
-    with exr.File(header, {"Z": GOOD}) as file:
-        file.write(str(tmp_path / "a.exr"))
-    with pytest.raises(BadInput, match="a part of its image only"):
-        read_depth_file(tmp_path / "a.exr")
-
-
-def test_exr_without_its_package_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import sys
-
-    monkeypatch.setitem(sys.modules, "OpenEXR", None)
-    (tmp_path / "a.exr").write_bytes(b"x")
-    with pytest.raises(BadInput, match=r"pip install 'dope-descriptors\[exr\]'"):
-        read_depth_file(tmp_path / "a.exr")
 
 
 def test_reducing_depth_makes_no_surface_between_two() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from pipeline.cameras.export import export_sequence
 from pipeline.cameras.known import KnownCameras, place_cameras, read_known_cameras
 from pipeline.cameras.sfm import SfmConfig
 from pipeline.commands import app
+from pipeline.engines import holding
 from pipeline.geometry import Camera
 from pipeline.sequence import Sequence
 
@@ -164,6 +166,16 @@ def test_a_sequence_without_cameras_is_refused_and_the_others_are_exported(seque
     assert run.exit_code == 1 and "a thing: 5 cameras" in run.output and "empty: " in run.output
     assert (tmp_path / "out" / "a thing" / "transforms.json").is_file()
     assert not (tmp_path / "out" / "empty").exists()
+
+
+def test_a_sequence_that_is_being_worked_on_is_refused(sequence, tmp_path):
+    """Else what it is exported as could be half of one state and half of the next."""
+    words = ["export", str(sequence.folder.parent), "--out", str(tmp_path / "out")]
+    with holding(sequence.folder):
+        run = CliRunner().invoke(app, words)
+    assert run.exit_code == 1 and f"is being worked on by process {os.getpid()}" in run.output
+    assert not (tmp_path / "out").exists()
+    assert CliRunner().invoke(app, words).exit_code == 0
 
 
 @pytest.mark.parametrize("arguments", [["--format", "ply"], ["--format", "colmap-text", "--depths"]])

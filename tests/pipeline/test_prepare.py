@@ -19,10 +19,11 @@ from pipeline import commands, prepare, tasks
 from pipeline.cameras.sfm import SfmConfig
 from pipeline.children import ChildFailed, ChildStopped
 from pipeline.correspond.match import CorrespondConfig
-from pipeline.inputs.sources import Source, find_sources
+from pipeline.inputs.sources import Source, find_sources, known_sources
 from pipeline.masks.imported import MasksConfig
 from pipeline.masks.mask_io import write_masks
 from pipeline.prepare import ColmapConfig, add_masks, correspond_all
+from pipeline.run import RunConfig, items_of, run_all
 from pipeline.sequence import Sequence
 from pipeline.stages import StageResult, read_marker
 from pipeline.tasks import RunOptions
@@ -244,6 +245,27 @@ def test_another_input_of_the_same_name_never_takes_the_place(photos: Path, tmp_
     assert states(colmap(photos, tmp_path / "w"))[0] == "frames ok skipped"
     photos.rename(tmp_path / "moved")
     assert states(colmap(tmp_path / "moved", tmp_path / "w"))[0] == "frames ok skipped", "a moved input is the same"
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [("{}", "does not say its id, source, kind"), ("[]", "is not a JSON object"),
+     ('{"id": "fox", "source": 7, "kind": "video"}', "does not say its source")],
+)  # fmt: skip
+def test_a_sequence_json_of_another_shape_stops_nothing(photos: Path, tmp_path: Path, text: str, reason: str) -> None:
+    work = tmp_path / "w"
+    colmap(photos, work)
+    sequence = Sequence(work / "fox")
+    (sequence.folder / "sequence.json").write_text(text)
+    with pytest.raises(BadInput, match=rf"sequence\.json: {reason}.*--overwrite"):
+        sequence.read_info()
+    assert known_sources(work) == {}
+    assert states(add_masks([sequence], MasksConfig(), {}, HERE)) == ["masks failed"]
+    (sequence.stages / "depth.json").unlink()
+    (row, *_) = run_all(items_of([], [sequence], {}, work), RunConfig(), HERE)
+    assert row.status == "failed" and "the same command with its INPUT" in str(row.reason)
+    assert states(colmap(photos, work, options=AGAIN)) == ["frames ok", "sfm ok", "depth ok"]
+    assert sequence.read_info().id == "fox"
 
 
 def test_an_input_that_cannot_be_read_does_not_stop_the_others(

@@ -25,6 +25,8 @@ from pipeline import commands, prepare, tasks
 from pipeline.engines import Share, holding_output
 from pipeline.inputs.sources import Source
 from pipeline.prepare import ColmapConfig, add_masks, correspond_all
+from pipeline.refused import keep_refused
+from pipeline.report.status_table import read_status
 from pipeline.run import Item, RunConfig, items_of, run_all, still_to_do
 from pipeline.sequence import Sequence, SequenceInfo
 from pipeline.stages import StageResult, fingerprint, read_marker, run_stage
@@ -216,6 +218,54 @@ def test_a_place_for_shards_that_is_taken_is_refused_before_any_work(tmp_path: P
     assert read_marker(ant, "masks") is None
     answer = prep_run(tmp_path / "nowhere.mp4", "--out", tmp_path / "new", "--shards", tmp_path / "s")
     assert "nowhere" in answer.output and "no sequence has correspondences" in str(answer.exception)
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--count", "30", "--set", "depth.agreement.tolerance=0.1"], "frames.count, depth.agreement"),
+        (["--mask-features"], "sfm.mask_features"),
+        (["--category", "mug"], "--category"),
+        (["--category-from", "parent", "--depths", "{}/depths"], "--category-from, --depths"),
+    ],
+)
+def test_what_has_no_effect_without_an_input_is_refused(tmp_path: Path, words: list[str], named: str) -> None:
+    ant = known(tmp_path / "w", "ant")
+    answer = prep_run("--out", tmp_path / "w", *words)
+    assert isinstance(answer.exception, UsageError) and f"as they are: {named} would have no" in str(answer.exception)
+    assert read_marker(ant, "masks") is None
+
+
+@pytest.mark.parametrize("setting", ["sfm.threads", "depth.threads"])
+def test_threads_are_a_flag_and_no_setting(tmp_path: Path, setting: str) -> None:
+    stage = setting.partition(".")[0]
+    (tmp_path / "threads.yaml").write_text(f"{stage}:\n  threads: 2\n")
+    for words in (["--set", f"{setting}=2"], ["--config", tmp_path / "threads.yaml"]):
+        answer = prep_run(tmp_path, "--out", tmp_path / "w", *words)
+        assert isinstance(answer.exception, UsageError) and "Use --threads" in str(answer.exception)
+
+
+def test_inputs_that_cannot_be_used_stay_to_be_seen_until_they_can(tmp_path: Path) -> None:
+    work = tmp_path / "w"
+    Sequence(work / "fox").write_info(SequenceInfo("fox", str(write_photos(tmp_path / "a/fox", pan(2))), "photos"))
+    other = write_photos(tmp_path / "b/fox", pan(2, seed=1))
+
+    def shown() -> dict[str, str]:
+        return {row["id"]: row["reason"] for row in read_status([work]).to_pylist() if row["status"] == "failed"}
+
+    lost, gone = tmp_path / "lost.mp4", tmp_path / "gone.mp4"
+    assert prep_run(lost, gone, "--out", work).exit_code == 1
+    assert sorted(shown()) == ["gone", "lost"] and f"{lost}: no such file" in shown()["lost"]
+    assert prep_run(lost, "--out", work, "--num-shards", 2, "--shard-index", 1).exit_code == 0
+    assert sorted(shown()) == ["lost"], "the other is not named any more; this one is the first part's"
+    page = tmp_path / "report.html"
+    assert CliRunner().invoke(commands.app, ["report", str(work), "--out", str(page)]).exit_code == 0
+    assert "no such file or folder" in page.read_text()
+    keep_refused(work, prepare.prepare([Source(other, "fox", "photos")], work, ColmapConfig(), HERE))
+    assert "holds the sequence of" in shown()["fox"] and "lost" not in shown()
+    assert prep_run("--out", work).exit_code == 1 and "fox" in shown(), "a run without inputs names none"
+    keep_refused(work, [])
+    assert not shown() and not (work / ".refused").exists()
 
 
 def test_the_part_that_ends_last_writes_the_shards(tmp_path: Path) -> None:

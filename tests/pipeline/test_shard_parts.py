@@ -1,5 +1,6 @@
 """Containers of an array job that write one folder of shards together."""
 
+import fcntl
 import multiprocessing
 import shutil
 from pathlib import Path
@@ -8,13 +9,13 @@ from typing import Any
 import pytest
 from synthetic import orbit, write_sequence
 
-from dope.common.errors import DiskFull
+from dope.common.errors import DiskFull, UsageError
 from pipeline.correspond.match import CorrespondConfig, correspond
 from pipeline.correspond.views import ViewsConfig
 from pipeline.engines import Share
 from pipeline.sequence import Sequence
 from pipeline.shards import dataset
-from pipeline.shards.dataset import ShardsConfig, verify_shards, write_shards
+from pipeline.shards.dataset import ShardsConfig, check_output, verify_shards, write_shards
 from pipeline.stages import run_stage
 
 CONFIG = ShardsConfig(samples_per_shard=7, holdout="none")
@@ -93,3 +94,68 @@ def test_a_part_that_broke_off_goes_on_and_the_old_dataset_stays(
     write_shards(sequences, out, CONFIG, share=Share(1, 2))
     assert bytes_of(out) == alone
     verify_shards(out)
+
+
+def test_what_killed_parts_left_is_not_in_the_dataset(
+    sequences: list[Sequence], alone: dict[str, bytes], tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    write_shards(sequences, out, CONFIG, share=Share(0, 2))
+    (tars,) = tmp_path.glob(".out.*.parts/tars")
+    (tars / ".train-000001.17717.partial.tar").write_bytes(b"half")
+    write_shards(sequences, out, CONFIG, share=Share(1, 2))
+    assert bytes_of(out) == alone
+    (out / ".train-000001.17717.partial.tar").write_bytes(b"half, by an earlier version")
+    write_shards(sequences, out, CONFIG, share=Share(1, 2), overwrite=True)
+    write_shards(sequences, out, CONFIG, share=Share(0, 2), overwrite=True)
+    assert bytes_of(out) == alone
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_job_killed_when_the_dataset_was_in_its_place_leaves_nothing(
+    sequences: list[Sequence], alone: dict[str, bytes], tmp_path: Path, overwrite: bool
+) -> None:
+    out = tmp_path / "out"
+    write_shards(sequences, out, CONFIG, share=Share(0, 2))
+    real = shutil.rmtree
+
+    def killed(path: Path, **options: Any) -> None:
+        if path.suffix == ".parts":
+            raise KeyboardInterrupt
+        real(path, **options)
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(shutil, "rmtree", killed)
+        write_shards(sequences, out, CONFIG, share=Share(1, 2))
+    assert bytes_of(out) == alone and len(list(tmp_path.iterdir())) == 2
+    for index in range(2):
+        write_shards(sequences, out, CONFIG, share=Share(index, 2), overwrite=overwrite)
+        assert bytes_of(out) == alone
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_parts_of_other_settings_go_unless_somebody_writes_them(
+    sequences: list[Sequence], tmp_path: Path, count: int
+) -> None:
+    out, other = tmp_path / "out", ShardsConfig(samples_per_shard=5, holdout="none")
+    write_shards(sequences, out, other, share=Share(0, 2))
+    (left,) = tmp_path.iterdir()
+    foreign = tmp_path / ".out.old.parts"
+    foreign.mkdir()
+
+    def write_all() -> None:
+        for index in range(count):
+            write_shards(sequences, out, CONFIG, share=Share(index, count), overwrite=True)
+
+    with (left / ".lock").open() as lock:
+        fcntl.flock(lock, fcntl.LOCK_SH)
+        write_all()
+    assert sorted(tmp_path.iterdir()) == sorted([left, foreign, out])
+    write_all()
+    assert sorted(tmp_path.iterdir()) == sorted([foreign, out])
+
+
+def test_a_mount_point_is_refused_before_any_work() -> None:
+    with pytest.raises(UsageError, match=r"mount point.*Name a folder inside it"):
+        check_output(Path("/proc"), CONFIG)

@@ -263,13 +263,16 @@ def test_sequences_that_are_not_ready_are_listed(work: Path, sequences: list[Seq
     (broken.views / "000007.jpg").unlink()
     torn = Sequence(Path(shutil.copytree(work / "bell", tmp_path / "torn")))
     torn.correspondences.write_bytes(torn.correspondences.read_bytes()[:999])
-    details = write_shards([*sequences[:2], flat, bare, never, lost, broken, torn], tmp_path / "out", CONFIG)
+    odd = Sequence(Path(shutil.copytree(work / "bell", tmp_path / "odd")))
+    (odd.folder / "sequence.json").write_text("[]")
+    details = write_shards([*sequences[:2], flat, bare, never, lost, broken, torn, odd], tmp_path / "out", CONFIG)
     assert details["sequences"] == 2
     reasons = details["left_out"]
     assert "empty: only 0 of 3 views" in reasons["flat"] and "dope prep masks" in reasons["bare"]
     assert reasons["lost"] == "stage 'sfm' failed: nothing registers"
     assert reasons["never"] == "stage 'correspond' has not been run"
     assert "000007.jpg" in reasons["broken"] and "correspondences.parquet" in reasons["torn"]
+    assert "odd/sequence.json: is not a JSON object" in reasons["odd"]
     assert json.loads((tmp_path / "out/dataset.json").read_text())["counts"]["left_out"] == reasons
     with pytest.raises(BadInput, match=r"never: .*not been run.*dope prep correspond"):
         write_shards([never], tmp_path / "none", CONFIG)

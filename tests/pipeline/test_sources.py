@@ -215,6 +215,20 @@ def test_a_sequence_keeps_its_name_when_inputs_of_the_same_name_join_it(tmp_path
     assert [source.id for source in find_sources([second], known=known_sources(work))[0]] == ["mug"]
 
 
+def test_a_run_that_goes_on_gives_the_ids_that_it_gave(tmp_path: Path) -> None:
+    """Whatever part of the run WORK holds by then, also beside an older sequence of the same name."""
+    films = [touch(tmp_path / name) for name in ("chair/001.mp4", "mug/001.mp4", "mug/002.mp4", "pot/chair_001.mp4")]
+    older, work = touch(tmp_path / "older/002.mp4"), tmp_path / "work"
+    Sequence(work / "002").write_info(SequenceInfo("002", str(older), "video"))
+    fresh = [source.id for source in find_sources(films, known=known_sources(work))[0]]
+    assert len(set(fresh)) == 4 and "001" not in fresh and fresh[2] == "mug_002"
+    for film, name in zip(films, fresh, strict=True):
+        Sequence(work / name).write_info(SequenceInfo(name, str(film), "video"))
+        known = known_sources(work)
+        assert [source.id for source in find_sources(films, known=known)[0]] == fresh
+        assert [source.id for source in find_sources(films[::-1], known=known)[0]] == fresh[::-1]
+
+
 def test_a_co3d_download_is_not_taken_for_photo_folders(tmp_path: Path) -> None:
     photo_folder(tmp_path / "apple/1_2_3/images")
     touch(tmp_path / "apple/frame_annotations.jgz")

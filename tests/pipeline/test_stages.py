@@ -97,10 +97,14 @@ def _interrupt(sequence: Sequence) -> None:
     run_stage(sequence, "sfm", Config(2), "a", work)
 
 
-def test_a_damaged_marker_counts_as_none(sequence: Sequence) -> None:
+@pytest.mark.parametrize(
+    "text", ['{"sequence": ', "[]", "{}", '{"sequence": "mug", "stage": "sfm", "status": "ok", "details": []}']
+)
+def test_a_damaged_marker_counts_as_none(sequence: Sequence, text: str) -> None:
     work = Work()
     run_stage(sequence, "sfm", Config(), "a", work)
-    stages.marker_path(sequence, "sfm").write_text('{"sequence": ')
+    stages.marker_path(sequence, "sfm").write_text(text)
+    assert read_marker(sequence, "sfm") is None
     run_stage(sequence, "sfm", Config(), "a", work)
     assert work.calls == 2
 

@@ -6,6 +6,7 @@ import fcntl
 import json
 import os
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pyarrow as pa
@@ -19,7 +20,7 @@ from dope.common.errors import BadInput, UsageError
 from pipeline.report import status_table
 from pipeline.report.filters import parse_condition, select, sort_rows
 from pipeline.report.status_row import NAMES, SCHEMA
-from pipeline.report.status_table import held_inodes, read_status, write_csv, write_parquet
+from pipeline.report.status_table import held_files, read_status, write_csv, write_parquet
 from pipeline.report.status_text import kind_of_reason, lines_of, summary
 
 
@@ -128,10 +129,37 @@ def test_a_held_sequence_is_running_and_is_not_disturbed(tmp_path: Path) -> None
     folder = write_files(tmp_path / "cup", 1)
     with (folder / ".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        if not held_inodes():
+        if not held_files():
             pytest.skip("this system has no /proc/locks")
         assert only_row(tmp_path)["status"] == "running"
     assert only_row(tmp_path)["status"] == "waiting"
+
+
+@pytest.mark.parametrize(
+    ("device", "running"),
+    [("{major:02x}:{minor:02x}", True), ("{major:02x}:{other:02x}", False), ("00:{other:02x}", True)],
+    ids=["the same", "another disk", "an anonymous one"],
+)
+@pytest.mark.parametrize("waiting", ["", "-> "])
+def test_a_lock_on_another_disk_is_not_taken_for_the_sequences(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str, running: bool, waiting: str
+) -> None:
+    """Inodes count from 1 on each disk: another disk's lock may well have the same."""
+    lock = write_files(tmp_path / "cup", 1) / ".lock"
+    lock.touch()
+    real, inode = os.stat, lock.stat().st_ino
+    disk = os.makedev(8, 1)
+
+    def stat(path: Any, **options: Any) -> Any:
+        return SimpleNamespace(st_ino=inode, st_dev=disk) if str(path).endswith(".lock") else real(path, **options)
+
+    monkeypatch.setattr(os, "stat", stat)
+    place = device.format(major=8, minor=1, other=2)
+    lines = (f"1: POSIX  ADVISORY  WRITE 99 08:01:{inode}", f"2: {waiting}FLOCK  ADVISORY  WRITE 99 {place}:{inode}")
+    (tmp_path / "locks").write_text("".join(f"{line} 0 EOF\n" for line in lines))
+    held = held_files(str(tmp_path / "locks"))
+    monkeypatch.setattr(status_table, "held_files", lambda: held)
+    assert (only_row(tmp_path)["status"] == "running") is running
 
 
 def test_other_folders_and_files_are_no_sequences(tmp_path: Path) -> None:
