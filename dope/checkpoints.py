@@ -53,6 +53,7 @@ def save_checkpoint(run: Path, state: TrainState, config: TrainConfig, dataset: 
         "dataset": dataset,
         "validation": state.validation,
         "untrained": state.untrained,
+        "damaged": sorted(state.damaged),
         "versions": {"dope": dope.__version__, "torch": str(torch.__version__)},
     }
     with files.atomic_path(path) as partial:
@@ -145,6 +146,7 @@ def resume(path: Path, state: TrainState, config: TrainConfig, dataset: str) -> 
     state.optimiser.load_state_dict(values["optimiser"])
     state.step, state.place = values["step"], Place(values["epoch"], values["samples_consumed"])
     state.validation, state.untrained = values["validation"], values["untrained"]
+    state.damaged = set(values.get("damaged", ()))
 
 
 def load_network(path: Path, device: torch.device | str = "cpu") -> tuple[DopeNetwork, dict[str, Any]]:

@@ -57,6 +57,9 @@ REQUIRED = (
 
 OPTIONAL = (
     ("Blender (bpy)", "bpy", "photoreal renders of meshes (planned)", "pip install '.[blender]' (Python 3.11 or 3.13)"),
+    ("s3fs", "s3fs", "shards in s3://", "pip install '.[s3]'"),
+    ("gcsfs", "gcsfs", "shards in gs://", "pip install '.[gs]'"),
+    ("huggingface_hub", "huggingface_hub", "shards in hf://", "pip install '.[hf]'"),
     ("Ray", "ray", "preparation on a cluster (planned)", "pip install '.[ray]'"),
 )
 
