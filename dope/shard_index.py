@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from dope.common.errors import BadInput
 from dope.storage import REMEDY, Shards, Storage, open_storage
-from dope.tar_samples import REMAKE, Location, ShardReader
+from dope.tar_samples import REMAKE, Location, OtherSample, ShardReader
 
 COLUMNS = ("key", "shard", "offset", "size", "sequence", "split", "n_correspondences")
 CHECKED_TOGETHER = 64
@@ -179,17 +179,18 @@ def _check_shards(index: SampleIndex, manifest: dict[str, dict[str, Any]], sizes
 
 
 def _check_samples(index: SampleIndex, first: NDArray[np.integer]) -> None:
-    """The shards' first samples are where the index says; where one is damaged, the shard's last one is."""
+    """The shards' first samples are where the index says, or where one is damaged, the shard's last one."""
     last = {name: row for row, name in enumerate(index.shards.tolist())}
     reader = ShardReader(index.storage)
     for start in range(0, len(first), CHECKED_TOGETHER):
         rows = first[start : start + CHECKED_TOGETHER].tolist()
         for row, members in zip(rows, reader.samples([index.location(row) for row in rows]), strict=True):
-            if not isinstance(members, BadInput):
-                continue
-            (other,) = reader.samples([index.location(last[str(index.shards[row])])])
-            if isinstance(other, BadInput):
+            if isinstance(members, OtherSample):
                 raise members
+            if isinstance(members, BadInput):
+                (other,) = reader.samples([index.location(last[str(index.shards[row])])])
+                if isinstance(other, BadInput):
+                    raise members
     reader.close()
 
 

@@ -17,6 +17,10 @@ EMPTY = bytes(BLOCK)
 REMAKE = "Copy the shard again from where it came, or write the shards anew with `dope prep shards --overwrite`"
 
 
+class OtherSample(BadInput):
+    """Whole tar members, but not those that the index says lie there."""
+
+
 class Location(NamedTuple):
     """Where a sample lies: `size` bytes at `offset` of `shard`, members named `key`.*"""
 
@@ -97,8 +101,10 @@ class ShardReader:
             members = split_members(part, where)
         except BadInput as error:
             return error
-        if not members or any(not name.startswith(at.key + ".") for name in members):
-            return BadInput(
+        if not members:
+            return BadInput(f"has nothing but zeros at byte {at.offset}", where=where, remedy=REMAKE)
+        if any(not name.startswith(at.key + ".") for name in members):
+            return OtherSample(
                 f"sample '{at.key}' is not at byte {at.offset}: the shard and index.parquet are of different datasets",
                 where=where,
                 remedy=REMAKE,
