@@ -113,8 +113,9 @@ def _image(
     if image is None:
         raise BadInput(f"{name} cannot be decoded", where=where, remedy=REMAKE)
     height, width = (reduction * side for side in image.shape[:2])
-    blue, green, red = cv2.split(resized(image, size))
-    return np.stack([red, green, blue]), (size / width, size / height)
+    planes = np.empty((3, size, size), np.uint8)
+    cv2.split(resized(image, size), list(planes[::-1]))  # into these arrays, BGR to RGB
+    return planes, (size / width, size / height)
 
 
 def _mask(members: Mapping[str, bytes], name: str, size: int, where: str) -> NDArray[np.bool_]:

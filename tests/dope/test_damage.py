@@ -18,6 +18,7 @@ from dope.checkpoints import list_checkpoints, read_checkpoint
 from dope.common.errors import BadInput
 from dope.config import TrainConfig, load_config
 from dope.distributed import Ranks
+from dope.order import Place, SampleOrder
 from dope.run_logging import read_metrics
 from dope.shard_index import read_index
 from dope.state import new_state, wrap
@@ -179,8 +180,6 @@ def test_a_run_on_remote_shards_is_that_on_local_ones(shards: Path, tmp_path: Pa
 
 @pytest.mark.parametrize("order", ["shuffled", "sequential"])
 def test_an_interrupted_epoch_goes_on_with_other_ranks_and_workers(shards: Path, order: str) -> None:
-    from dope.order import Place, SampleOrder
-
     dataset = PairDataset(shards, "train", image_size=32)  # one shard, and more workers than that
     rows = SampleOrder(dataset.index.objects, 4, order=order, block=2)  # type: ignore[arg-type]
     first = next(iter(PairLoader(dataset, rows.batches(Place(), 1))))
@@ -196,19 +195,35 @@ def test_an_interrupted_epoch_goes_on_with_other_ranks_and_workers(shards: Path,
 
 @pytest.mark.timeout(240)
 def test_two_ranks_count_together_and_stop_together(copy: Path, tmp_path: Path) -> None:
-    damage(copy, 1, 6)
-    arguments = [argument for value in TINY for argument in ("--set", value)]
+    dataset = PairDataset(copy, "train", image_size=32)
+    rows = SampleOrder(dataset.index.objects, 8).epoch(0)[0]
+    damage(copy, *dataset.index.objects[rows[[0, 4]]])  # one in the share of each rank
     root = Path(__file__).parents[2]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(root), "GLOO_SOCKET_IFNAME": "lo"}
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", __file__]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": f"{root}:{root}/tests/dope"}
+    environment["GLOO_SOCKET_IFNAME"] = "lo"
+    done = subprocess.run(
+        [*command, str(copy), str(tmp_path)], env=environment, timeout=200, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    for rank in (0, 1):  # each alone would be within the limit of 1
+        said = (tmp_path / f"{rank}.txt").read_text().splitlines()
+        assert "2 damaged, data.max_bad_samples is 1" in said[0] and said[1] == "finished 2"
+    assert {line["key"] for line in read_metrics(tmp_path / "run", "damaged")} == set(dataset.index.keys[rows[[0, 4]]])
 
-    def run(limit: int) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "cli", "train", str(copy), "--out", str(tmp_path / "run"), "--preset", "nano"]
-        command += [*arguments, "--nproc", "2", "--max-bad-samples", str(limit)]
-        return subprocess.run(command, env=environment, timeout=200, capture_output=True, text=True, cwd=root)
 
-    stopped = run(1)  # one on each rank would be within a limit that each had alone
-    assert stopped.returncode == 1 and stopped.stderr.count("2 damaged, data.max_bad_samples is 1") == 2, stopped.stderr
-    finished = run(2)
-    assert finished.returncode == 0, finished.stderr
-    assert read_metrics(tmp_path / "run", "end")[-1]["damaged"] == 2
-    assert len({line["key"] for line in read_metrics(tmp_path / "run", "damaged")}) == 2
+def on_a_rank(shards: Path, out: Path) -> None:
+    """What each of two ranks does: train with a limit that is too low, then with one that is not."""
+    torch.set_num_threads(1)
+    said = []
+    for limit in (1, 2):
+        try:
+            result = train(shards, out / "run", tiny("data.batch_size=8", f"data.max_bad_samples={limit}"))
+            said.append(f"{result['status']} {result['damaged']}")
+        except BadInput as error:
+            said.append(str(error))
+    (out / f"{os.environ['RANK']}.txt").write_text("\n".join(said))
+
+
+if __name__ == "__main__":
+    on_a_rank(Path(sys.argv[1]), Path(sys.argv[2]))
