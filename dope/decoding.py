@@ -36,27 +36,34 @@ class DecodedPair:
 
 
 def decode_pair(
-    members: Mapping[str, bytes], number: int, key: str, *, image_size: int, max_points: int, where: str
+    members: Mapping[str, bytes],
+    number: int,
+    key: str,
+    *,
+    images: NDArray[np.uint8],
+    masks: NDArray[np.bool_],
+    max_points: int,
+    where: str,
 ) -> DecodedPair:
-    """Decode the members of a pair sample.
+    """Decode the members of a pair sample; views of another size are resized and their points scaled.
 
     Args:
         members: `1.jpg`, `2.jpg`, `1.png`, `2.png` and `corr.npy`.
         number: of the object.
-        image_size: side in pixels; views of another size are resized and their points scaled.
+        images, masks: (2, 3, S, S) and (2, S, S), where the views are to be written.
         max_points: correspondences kept.
         where: the shard and the sample, for errors.
 
     Raises:
         BadInput: a member is missing or cannot be decoded.
     """
-    image1, scale1 = _image(members, "1.jpg", image_size, where)
-    image2, scale2 = _image(members, "2.jpg", image_size, where)
-    masks = (_mask(members, "1.png", image_size, where), _mask(members, "2.png", image_size, where))
+    scale = [*_image(members, "1.jpg", images[0], where), *_image(members, "2.jpg", images[1], where)]
+    for view in (0, 1):
+        _mask(members, f"{view + 1}.png", masks[view], where)
     points = decode_points(_member(members, "corr.npy", where), max_points, where)
-    if (scale := (*scale1, *scale2)) != (1, 1, 1, 1):
+    if scale != [1, 1, 1, 1]:
         points = points * np.array(scale, np.float32)
-    return DecodedPair((image1, image2), masks, points, number, key)
+    return DecodedPair((images[0], images[1]), (masks[0], masks[1]), points, number, key)
 
 
 def decode_jpeg(data: bytes, smallest: int) -> tuple[NDArray[np.uint8] | None, int]:
@@ -105,24 +112,22 @@ def resized(image: NDArray[Any], size: int | None) -> NDArray[Any]:
     return cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
 
 
-def _image(
-    members: Mapping[str, bytes], name: str, size: int, where: str
-) -> tuple[NDArray[np.uint8], tuple[float, float]]:
-    """(3, size, size) RGB, and by what x and y of its points are multiplied."""
+def _image(members: Mapping[str, bytes], name: str, out: NDArray[np.uint8], where: str) -> tuple[float, float]:
+    """Write a JPEG into `out` (3, S, S) as RGB; return by what x and y of its points are multiplied."""
+    size = out.shape[-1]
     image, reduction = decode_jpeg(_member(members, name, where), size)
     if image is None:
         raise BadInput(f"{name} cannot be decoded", where=where, remedy=REMAKE)
     height, width = (reduction * side for side in image.shape[:2])
-    planes = np.empty((3, size, size), np.uint8)
-    cv2.split(resized(image, size), list(planes[::-1]))  # into these arrays, BGR to RGB
-    return planes, (size / width, size / height)
+    cv2.split(resized(image, size), list(out[::-1]))  # into these arrays, BGR to RGB
+    return size / width, size / height
 
 
-def _mask(members: Mapping[str, bytes], name: str, size: int, where: str) -> NDArray[np.bool_]:
+def _mask(members: Mapping[str, bytes], name: str, out: NDArray[np.bool_], where: str) -> None:
     mask = _imdecode(_member(members, name, where), cv2.IMREAD_GRAYSCALE)
     if mask is None:
         raise BadInput(f"{name} cannot be decoded", where=where, remedy=REMAKE)
-    return resized(mask, size) > 127
+    np.greater(resized(mask, out.shape[-1]), 127, out=out)
 
 
 def _member(members: Mapping[str, bytes], name: str, where: str) -> bytes:

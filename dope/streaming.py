@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from torch import Tensor
+from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset
 
 from dope.batch import DamagedSample, PairBatch
@@ -19,7 +19,7 @@ from dope.common.errors import BadInput, DopeError
 from dope.decoding import DecodedPair, decode_pair
 from dope.shard_index import SampleIndex, read_index
 from dope.storage import Shards
-from dope.tar_samples import REMAKE, Location, ShardReader
+from dope.tar_samples import REMAKE, ShardReader
 
 ALL_FOUR = 0x01010101
 """Four bools that are True, as one number: NumPy's `all` over so short an axis takes twenty times as long."""
@@ -64,11 +64,7 @@ class PairDataset(Dataset):
 
     def read(self, rows: Sequence[int]) -> list[DecodedPair | DamagedSample]:
         """Read the samples of `rows` together, in few long reads, and decode each."""
-        locations = [self.index.location(row) for row in rows]
-        return [
-            self._decoded(row, at, members)
-            for row, at, members in zip(rows, locations, self._reader.samples(locations), strict=True)
-        ]
+        return self._read(rows, *self._arrays(len(rows)))
 
     def batch(self, rows: Sequence[int]) -> PairBatch:
         """The samples of `rows` as a batch, damaged ones filled in for.
@@ -78,36 +74,60 @@ class PairDataset(Dataset):
         image counts once more in BatchNorm and in the mask loss. `damaged` of the batch says which. Without any good
         sample, the images are black and the objects -1.
         """
-        pairs = self.read(rows)
-        good = [pair for pair in pairs if isinstance(pair, DecodedPair)]
-        fill = cycle([replace(pair, points=pair.points[:0]) for pair in good] or [self._black()])
-        filled = [pair if isinstance(pair, DecodedPair) else next(fill) for pair in pairs]
+        images, masks = self._arrays(len(rows))
+        pairs = self._read(rows, images, masks)
         damaged = {place: pair for place, pair in enumerate(pairs) if isinstance(pair, DamagedSample)}
-        return replace(collate(filled), damaged=damaged)
+        if len(damaged) == len(pairs):
+            images[:], masks[:] = 0, False
+        black = DecodedPair(
+            (images[0, 0], images[1, 0]), (masks[0, 0], masks[1, 0]), np.zeros((0, 4), np.float32), -1, ""
+        )
+        fill = cycle([pair for pair in pairs if isinstance(pair, DecodedPair)] or [black])
+        filled = []
+        for place, pair in enumerate(pairs):
+            if isinstance(pair, DamagedSample):
+                good = next(fill)
+                images[:, place], masks[:, place] = good.images, good.masks
+                pair = replace(good, points=good.points[:0])
+            filled.append(pair)
+        return replace(_batch_of(filled, images, masks), damaged=damaged)
 
     def error(self, sample: DamagedSample) -> BadInput:
         """A damaged sample as an error."""
         where = f"{self.index.storage.where(sample.shard)}, sample {sample.key}"
         return BadInput(sample.reason, where=where, remedy=REMAKE)
 
-    def _decoded(self, row: int, at: Location, members: dict[str, bytes] | BadInput) -> DecodedPair | DamagedSample:
-        try:
-            if isinstance(members, BadInput):
-                raise members
-            sizes = {"image_size": self.image_size, "max_points": self.max_points}
-            return decode_pair(members, int(self.index.objects[row]), at.key, where=at.shard, **sizes)
-        except BadInput as error:
-            return DamagedSample(at.shard, at.key, error.what)
+    def _arrays(self, n: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        side = self.image_size
+        return np.empty((2, n, 3, side, side), np.uint8), np.empty((2, n, side, side), bool)
 
-    def _black(self) -> DecodedPair:
-        image = np.zeros((3, self.image_size, self.image_size), np.uint8)
-        mask = np.zeros(image.shape[1:], bool)
-        return DecodedPair((image, image), (mask, mask), np.zeros((0, 4), np.float32), -1, "")
+    def _read(
+        self, rows: Sequence[int], images: NDArray[np.uint8], masks: NDArray[np.bool_]
+    ) -> list[DecodedPair | DamagedSample]:
+        """Decode into arrays (2, B, 3, S, S) and (2, B, S, S): a batch needs no copy of what was decoded."""
+        locations = [self.index.location(row) for row in rows]
+        pairs: list[DecodedPair | DamagedSample] = []
+        for place, (at, members) in enumerate(zip(locations, self._reader.samples(locations), strict=True)):
+            try:
+                if isinstance(members, BadInput):
+                    raise members
+                out: dict[str, Any] = {"images": images[:, place], "masks": masks[:, place]}
+                number = int(self.index.objects[rows[place]])
+                pairs.append(decode_pair(members, number, at.key, max_points=self.max_points, where=at.shard, **out))
+            except BadInput as error:
+                pairs.append(DamagedSample(at.shard, at.key, error.what))
+        return pairs
 
 
 def collate(pairs: Sequence[DecodedPair]) -> PairBatch:
     """Stack decoded pairs; points are padded to the largest number in the batch (at least one row)."""
-    size = pairs[0].images[0].shape[-1]
+    images = np.stack([np.stack(pair.images) for pair in pairs], axis=1)
+    masks = np.stack([np.stack(pair.masks) for pair in pairs], axis=1)
+    return _batch_of(pairs, images, masks)
+
+
+def _batch_of(pairs: Sequence[DecodedPair], images: NDArray[np.uint8], masks: NDArray[np.bool_]) -> PairBatch:
+    size = images.shape[-1]
     # released data sets pad with -1: whatever lies outside an image is no correspondence
     points = np.full((len(pairs), max(1, *(len(pair.points) for pair in pairs)), 4), -1, np.float32)
     for row, pair in zip(points, pairs, strict=True):
@@ -116,10 +136,10 @@ def collate(pairs: Sequence[DecodedPair]) -> PairBatch:
     valid = inside.view(np.uint32)[..., 0] == ALL_FOUR
     points[~valid] = 0
     return PairBatch(
-        images1=_stacked([pair.images[0] for pair in pairs]),
-        images2=_stacked([pair.images[1] for pair in pairs]),
-        masks1=_stacked([pair.masks[0] for pair in pairs])[:, None],
-        masks2=_stacked([pair.masks[1] for pair in pairs])[:, None],
+        images1=torch.from_numpy(images[0]),
+        images2=torch.from_numpy(images[1]),
+        masks1=torch.from_numpy(masks[0])[:, None],
+        masks2=torch.from_numpy(masks[1])[:, None],
         points=torch.from_numpy(points),
         valid=torch.from_numpy(valid),
         objects=torch.tensor([pair.object for pair in pairs], dtype=torch.int64),
@@ -205,7 +225,3 @@ def _quiet_worker(_: int) -> None:
     # the loader says so or when their parent is gone
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _stacked(arrays: Sequence[np.ndarray]) -> Tensor:
-    return torch.from_numpy(np.stack(arrays))

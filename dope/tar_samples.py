@@ -103,13 +103,14 @@ class ShardReader:
             return error
         if not members:
             return BadInput(f"has nothing but zeros at byte {at.offset}", where=where, remedy=REMAKE)
-        if any(not name.startswith(at.key + ".") for name in members):
-            return OtherSample(
-                f"sample '{at.key}' is not at byte {at.offset}: the shard and index.parquet are of different datasets",
-                where=where,
-                remedy=REMAKE,
-            )
-        return {name[len(at.key) + 1 :]: content for name, content in members.items()}
+        start, found = at.key + ".", {}
+        for name, content in members.items():
+            if not name.startswith(start):
+                what = f"sample '{at.key}' is not at byte {at.offset}"
+                reason = "the shard and index.parquet are of different datasets"
+                return OtherSample(f"{what}: {reason}", where=where, remedy=REMAKE)
+            found[name[len(start) :]] = content
+        return found
 
 
 def _checksum(header: bytes) -> int:

@@ -7,7 +7,7 @@ import pytest
 from tiny_shards import encode, make_pair, write_shards
 
 from dope.common.errors import BadInput
-from dope.decoding import decode_jpeg, decode_pair, decode_points, jpeg_size, resized
+from dope.decoding import DecodedPair, decode_jpeg, decode_pair, decode_points, jpeg_size, resized
 from dope.streaming import PairDataset
 
 
@@ -27,6 +27,11 @@ def members_of(size: int) -> dict[str, bytes]:
     views = {f"{v + 1}.{kind}": encode("." + kind, of[v]) for v in (0, 1) for kind, of in
              (("jpg", pair.images), ("png", pair.masks))}  # fmt: skip
     return {**views, "corr.npy": npy(pair.points)}
+
+
+def decode(members: dict[str, bytes], size: int, number: int = 0) -> DecodedPair:
+    images, masks = np.empty((2, 3, size, size), np.uint8), np.empty((2, size, size), bool)
+    return decode_pair(members, number, "k", images=images, masks=masks, max_points=4096, where="x")
 
 
 def test_smaller_images_scale_points_and_shrink_by_area(shards: Path) -> None:
@@ -69,7 +74,7 @@ def test_no_jpeg_has_no_size() -> None:
 
 @pytest.mark.parametrize("size", [32, 64])
 def test_reduced_views_keep_points_on_the_object(size: int) -> None:
-    decoded = decode_pair(members_of(128), 5, "k", image_size=size, max_points=4096, where="x")
+    decoded = decode(members_of(128), size, 5)
     assert decoded.object == 5 and decoded.images[0].shape == (3, size, size)
     np.testing.assert_allclose(decoded.points, make_pair(1, 0, 128).points * size / 128, rtol=1e-6)
     for view in (0, 1):
@@ -108,7 +113,7 @@ def test_a_member_that_is_missing_or_damaged_is_named(name: str) -> None:
     members = members_of(64)
     for data in (b"", members[name][:40], b"\0" * 500):
         with pytest.raises(BadInput, match=rf"{name} cannot be"):
-            decode_pair({**members, name: data}, 0, "k", image_size=64, max_points=9, where="x")
+            decode({**members, name: data}, 64)
     del members[name]
     with pytest.raises(BadInput, match=rf"x: has no {name}"):
-        decode_pair(members, 0, "k", image_size=64, max_points=9, where="x")
+        decode(members, 64)
