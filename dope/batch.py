@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
+
+
+@dataclass(frozen=True)
+class DamagedSample:
+    """A sample that cannot be read or decoded: its shard's name, its key, and why."""
+
+    shard: str
+    key: str
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -19,6 +29,7 @@ class PairBatch:
         valid: (B, N) bool; False for padding and for points that augmentation moved out of an image.
         objects: (B,) int64, a stable number of the object (sequence); equal numbers are never each other's negatives.
         keys: the samples' keys, for error messages.
+        damaged: samples that were to be in the batch, by their place; what lies there instead only fills the place.
     """
 
     images1: Tensor
@@ -29,6 +40,7 @@ class PairBatch:
     valid: Tensor
     objects: Tensor
     keys: tuple[str, ...]
+    damaged: Mapping[int, DamagedSample] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.objects)
@@ -39,6 +51,12 @@ class PairBatch:
 
     def pin_memory(self) -> PairBatch:
         return replace(self, **{n: getattr(self, n).pin_memory() for n in TENSORS})
+
+    def without_damaged(self) -> PairBatch:
+        """The places that damaged samples left left out; maybe none remain."""
+        whole = [place for place in range(len(self)) if place not in self.damaged]
+        tensors = {n: getattr(self, n)[whole] for n in TENSORS}
+        return replace(self, **tensors, keys=tuple(self.keys[place] for place in whole), damaged={})
 
     def swapped(self, swap: Tensor) -> PairBatch:
         """Exchange the two views of the pairs where `swap` (B,) bool is True."""

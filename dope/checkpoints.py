@@ -59,6 +59,7 @@ def save_checkpoint(
         "dataset": dataset,
         "validation": state.validation,
         "untrained": state.untrained,
+        "damaged": sorted(state.damaged),
         "versions": {"dope": dope.__version__, "torch": str(torch.__version__)},
     }
     with files.atomic_path(path) as partial:
@@ -209,6 +210,7 @@ def resume(path: Path, state: TrainState, config: TrainConfig, dataset: str) -> 
     state.optimiser.load_state_dict(values["optimiser"])
     state.step, state.place = values["step"], Place(values["epoch"], values["samples_consumed"])
     state.validation, state.untrained = values["validation"], values["untrained"]
+    state.damaged = set(values.get("damaged", ()))
 
 
 def resume_newest(

@@ -14,7 +14,12 @@ import typer
 from dope.common.errors import UsageError
 from dope.preset_files import preset_names, preset_summary
 
-Shards = Annotated[Path, typer.Argument(help="The folder that `dope prep shards --out` wrote.", show_default=False)]
+Shards = Annotated[
+    str,
+    typer.Argument(
+        help="The folder that `dope prep shards --out` wrote, or a URL of it: s3://, gs://, hf://.", show_default=False
+    ),
+]
 Run = Annotated[Path, typer.Argument(help="A run (its newest checkpoint) or a checkpoint.", show_default=False)]
 Device = Annotated[str, typer.Option(help="auto, cpu, cuda or cuda:N.")]
 PRESETS_HELP = "\n\n".join(f"{name}: {preset_summary(name)}" for name in preset_names())
@@ -42,6 +47,10 @@ def train(
         int | None,
         typer.Option(min=1, help="Profile so many steps into RUN/profile, then train on.", show_default=False),
     ] = None,
+    max_bad_samples: Annotated[
+        int | None,
+        typer.Option(min=0, help="Damaged samples to put up with.  [default: 0]", show_default=False),
+    ] = None,
 ) -> None:
     """Train DOPE: corresponding pixels of two views get the same descriptor, all others different ones.
 
@@ -59,10 +68,13 @@ def train(
       dope train shards --out run --set optimiser.lr=3e-4 --set data.batch_size=64
 
       torchrun --nproc-per-node 4 $(which dope) train shards --out run
+
+      dope train s3://bucket/shards --out run --set data.order=sequential
     """
     from dope.config import load_config
 
-    resolved = load_config(preset, config, set_ or ())
+    overrides = [*(set_ or ()), *([] if max_bad_samples is None else [f"data.max_bad_samples={max_bad_samples}"])]
+    resolved = load_config(preset, config, overrides)
     if nproc > 1 and "RANK" not in os.environ:
         from dope.shard_index import read_index
 

@@ -16,9 +16,10 @@ from dope.augmentation import AugmentationConfig
 from dope.common import files, settings
 from dope.common.errors import UsageError
 from dope.networks import NetworkConfig
+from dope.order import Order
 from dope.preset_files import merged, preset_values
 
-RESULT_NEUTRAL = ("data.workers", "device", "validation", "checkpoint", "log")
+RESULT_NEUTRAL = ("data.workers", "data.max_bad_samples", "device", "validation", "checkpoint", "log", "log_every")
 """Settings that do not change what is learnt: a run may be resumed with other values of these."""
 
 
@@ -38,6 +39,14 @@ class DataConfig:
     """Correspondences read of a pair: the first ones, which the shards keep in farthest-point order."""
     workers: int = 8
     """Processes on each rank that decode; 0 decodes in the training process."""
+    order: Order = "shuffled"
+    """shuffled, or sequential: blocks of neighbouring samples in long reads, for remote or slow storage."""
+    block: int = 32
+    """Neighbouring samples that stay together in sequential order: less is more random, more reads longer."""
+    min_correspondences: int = 1
+    """Training pairs with fewer correspondences are left out."""
+    max_bad_samples: int = 0
+    """Damaged samples (by their keys, over all ranks and resumes) that are put up with; one more stops the run."""
 
 
 @dataclass(frozen=True)
@@ -202,6 +211,9 @@ def check(config: TrainConfig) -> None:
         ("data.points", data.points >= 1, "must be at least 1"),
         ("data.max_points", data.max_points >= data.points, "must not be less than data.points"),
         ("data.workers", data.workers >= 0, "must not be negative"),
+        ("data.block", data.block >= 1, "must be at least 1"),
+        ("data.min_correspondences", data.min_correspondences >= 0, "must not be negative"),
+        ("data.max_bad_samples", data.max_bad_samples >= 0, "must not be negative"),
         ("network.width", network.width > 0, "must be positive"),
         ("network.pyramid", network.pyramid >= 1, "must be at least 1"),
         ("network.projector", bool(network.projector) and min(network.projector) >= 1, "must be one or more widths"),
@@ -238,9 +250,10 @@ def check(config: TrainConfig) -> None:
 def differing_keys(ours: dict[str, Any], theirs: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
     """Settings that differ between two configs given as plain dicts: dotted key -> (ours, theirs).
 
-    Those of `RESULT_NEUTRAL` are left out; a key that only one side has counts as None on the other.
+    Those of `RESULT_NEUTRAL` are left out. A setting that `theirs` lacks is younger than it, and had its default's
+    effect then; one that only `theirs` has counts as None on our side.
     """
-    left, right = _flat(ours), _flat(theirs)
+    left, right = _flat(ours), _flat(settings.to_dict(TrainConfig())) | _flat(theirs)
     return {
         key: (left.get(key), right.get(key))
         for key in sorted(left.keys() | right.keys())

@@ -58,6 +58,9 @@ REQUIRED = (
 OPTIONAL = (
     ("Blender (bpy)", "bpy", "photoreal renders of meshes (planned)", "pip install '.[blender]' (Python 3.11 or 3.13)"),
     ("Weights & Biases", "wandb", "--set log.wandb=PROJECT of dope train", "pip install 'dope-descriptors[wandb]'"),
+    ("s3fs", "s3fs", "shards in s3://", "pip install '.[s3]'"),
+    ("gcsfs", "gcsfs", "shards in gs://", "pip install '.[gs]'"),
+    ("huggingface_hub", "huggingface_hub", "shards in hf://", "pip install '.[hf]'"),
     ("Ray", "ray", "preparation on a cluster (planned)", "pip install '.[ray]'"),
 )
 

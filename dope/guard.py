@@ -14,8 +14,8 @@ from dope.common import files
 from dope.common.errors import DopeError
 
 if TYPE_CHECKING:
+    from dope.run import Run
     from dope.run_logging import RunLog, SilentLog
-    from dope.trainer import Run
 
 NAMES = {"loss": "loss", "grad_norm": "norm of the gradient"}
 """What is watched of a step's report, and what it is called in an error."""

@@ -1,8 +1,11 @@
 """The order of training samples: a function of (seed, epoch) alone, fixed before it is split over ranks and workers.
 
-An epoch is made of rounds; a round holds each object once, shuffled, with one pair of its own. The pairs of an object
-are drawn without replacement until all were used, then anew. The place in the run is (epoch, samples consumed): going
-on from there gives the samples not yet seen, once each, with any number of workers or ranks.
+An epoch is made of rounds; a round holds each object once, with one pair of its own. The place in the run is (epoch,
+samples consumed): going on from there gives the samples not yet seen, once each, with any number of workers or ranks.
+
+shuffled: the objects of a round are shuffled, and each object's pairs are drawn without replacement until all were
+used, then anew. sequential, for slow storage: a round takes one round of the shards (every object's k-th pair lies
+together there), cut into blocks of neighbours; the blocks are shuffled, and a batch is made of a few of them.
 """
 
 from __future__ import annotations
@@ -10,6 +13,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +22,10 @@ from dope.common.errors import UsageError
 from dope.common.seeds import derive_seed, generator
 
 logger = logging.getLogger(__name__)
+
+Order = Literal["shuffled", "sequential"]
+BLOCKS_MIXED = 4
+"""Blocks of neighbours whose samples are shuffled together (sequential order); a batch that holds more mixes more."""
 
 
 @dataclass(frozen=True)
@@ -32,19 +40,29 @@ class SampleOrder:
     """Cuts epochs into batches of sample rows.
 
     Args:
-        objects: (N,) the object number of each sample row.
+        objects: (N,) the object number of each sample row, in the order in which the rows lie in the shards.
         batch_size: samples in a batch over all ranks.
         pairs_per_object: rounds in an epoch.
         seed: the run's seed.
+        order: shuffled or sequential.
+        block: neighbouring samples that stay together in sequential order.
 
     Raises:
         UsageError: an epoch is smaller than one batch.
     """
 
     def __init__(
-        self, objects: NDArray[np.integer], batch_size: int, *, pairs_per_object: int = 1, seed: int = 12345
+        self,
+        objects: NDArray[np.integer],
+        batch_size: int,
+        *,
+        pairs_per_object: int = 1,
+        seed: int = 12345,
+        order: Order = "shuffled",
+        block: int = 32,
     ) -> None:
         self.batch_size, self.rounds, self.seed = batch_size, pairs_per_object, seed
+        self.sequential, self.block = order == "sequential", block
         self._by_object = np.argsort(objects, kind="stable")
         self._numbers, self._first, self._counts = np.unique(
             np.asarray(objects)[self._by_object], return_index=True, return_counts=True
@@ -72,14 +90,21 @@ class SampleOrder:
         rest = np.empty(0, np.int64)  # objects of the batch that the last round left incomplete
         for step in range(self.rounds):
             number = epoch * self.rounds + step
-            order = generator(self.seed, "round", number).permutation(self.n_objects)
+            random = generator(self.seed, "round", number)
+            missing = -len(rest) % self.batch_size
+            shown = self._rows_in_turn(number) if self.sequential else self._pair_of_round(number)
+            order = self._in_blocks(shown, random) if self.sequential else random.permutation(self.n_objects)
             if len(rest) and self.n_objects >= self.batch_size:
-                order = _without_first(order, rest, self.batch_size - len(rest))
-            rows.append(self._pair_of_round(number)[order])
+                order = _without_first(order, rest, missing)
+            if self.sequential:
+                order = self._mixed_blocks(order, missing, random)
+            rows.append(shown[order])
             pending = np.concatenate([rest, order])
             rest = pending[len(pending) - len(pending) % self.batch_size :]
         whole = self.steps_per_epoch * self.batch_size
-        return np.concatenate(rows)[:whole].reshape(self.steps_per_epoch, self.batch_size)
+        batches = np.concatenate(rows)[:whole].reshape(self.steps_per_epoch, self.batch_size)
+        # which sample of a batch is which says nothing; side by side, a rank's share is neighbours as well
+        return np.sort(batches, axis=1) if self.sequential else batches
 
     def batches(self, start: Place, epochs: int, *, rank: int = 0, world: int = 1) -> Iterator[list[int]]:
         """The rows of `rank`'s contiguous share of each global batch, from `start` to the end of `epochs`.
@@ -116,6 +141,30 @@ class SampleOrder:
         keys = _mixed(np.arange(len(self._by_object)), np.repeat(cycle, self._counts), derive_seed(self.seed, "pairs"))
         ranked = np.lexsort((keys, np.repeat(np.arange(self.n_objects), self._counts)))
         return self._by_object[ranked[self._first + position]]
+
+    def _rows_in_turn(self, number: int) -> NDArray[np.int64]:
+        """(n_objects,) the same, but the k-th pair of every object, with a k drawn without replacement.
+
+        Objects with fewer pairs show them again, beginning with another one each time that all k were drawn.
+        """
+        most = int(self._counts.max())
+        cycle, position = divmod(number, most)
+        k = int(generator(self.seed, "turns", cycle).permutation(most)[position])
+        return self._by_object[self._first + np.where(k < self._counts, k, (k + cycle) % self._counts)]
+
+    def _in_blocks(self, shown: NDArray[np.int64], random: np.random.Generator) -> NDArray[np.int64]:
+        """The objects as their rows lie in the shards, cut into blocks (elsewhere in each round), these shuffled."""
+        cuts = np.arange(int(random.integers(1, self.block + 1)), self.n_objects, self.block)
+        blocks = np.split(np.argsort(shown), cuts)
+        return np.concatenate([blocks[i] for i in random.permutation(len(blocks))])
+
+    def _mixed_blocks(self, order: NDArray[np.int64], missing: int, random: np.random.Generator) -> NDArray[np.int64]:
+        """Shuffle within windows of whole batches that hold at least `BLOCKS_MIXED` blocks, after the first `missing`
+        samples, which complete the batch of the round before."""
+        window = -(-BLOCKS_MIXED * self.block // self.batch_size) * self.batch_size
+        starts = range(missing, len(order), window)
+        mixed = [random.permutation(order[start : start + window]) for start in starts]
+        return np.concatenate([order[:missing], *mixed])
 
 
 def _without_first(order: NDArray[np.int64], taken: NDArray[np.int64], n: int) -> NDArray[np.int64]:

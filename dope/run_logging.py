@@ -157,6 +157,8 @@ def describe_start(facts: dict[str, Any]) -> str:
         f"{facts['steps_per_epoch']:,} steps an epoch, {facts['total_steps']:,} in all",
         f"{facts['parameters'] / 1e6:.1f} M parameters, {facts['precision']}, {facts['device']}{ranks}",
     ]
+    if facts["left_out"]:
+        lines.append(f"{facts['left_out']:,} pairs have too few correspondences (data.min_correspondences): left out")
     if facts["resumed_from"]:
         lines.append(f"going on at step {facts['resumed_at']:,} from {facts['resumed_from']}")
     return "\n".join(lines)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,11 +14,13 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from dope.common import files
 from dope.common.errors import BadInput
-from dope.tar_samples import REMAKE, ShardReader
+from dope.storage import REMEDY, Shards, Storage, open_storage
+from dope.tar_samples import REMAKE, Location, OtherSample, ShardReader
 
-COLUMNS = ("key", "shard", "offset", "size", "sequence", "split")
+COLUMNS = ("key", "shard", "offset", "size", "sequence", "split", "n_correspondences")
+CHECKED_TOGETHER = 64
+"""Shards whose first samples are read at a time."""
 
 
 @dataclass(frozen=True)
@@ -27,27 +28,54 @@ class SampleIndex:
     """The samples of one split, in the order in which they were written.
 
     Attributes:
-        folder: where the shards lie.
+        storage: where the shards lie.
         keys, shards, sequences: (N,) str.
         offsets, sizes: (N,) int64, the bytes of each sample in its shard.
+        correspondences: (N,) int64, how many each sample has.
         objects: (N,) int64, the place of the sample's sequence in the sorted list of all sequences of the dataset.
         fingerprint: of the contents of this split's shards, the same for every copy.
+        left_out: samples that the split has besides these.
     """
 
-    folder: Path
+    storage: Storage
     keys: NDArray[np.str_]
     shards: NDArray[np.str_]
     sequences: NDArray[np.str_]
     offsets: NDArray[np.int64]
     sizes: NDArray[np.int64]
+    correspondences: NDArray[np.int64]
     objects: NDArray[np.int64]
     fingerprint: str
+    left_out: int = 0
 
     def __len__(self) -> int:
         return len(self.keys)
 
+    def location(self, row: int) -> Location:
+        """Where a sample lies."""
+        return Location(str(self.shards[row]), int(self.offsets[row]), int(self.sizes[row]), str(self.keys[row]))
 
-def read_index(folder: Path, split: str) -> SampleIndex:
+    def with_correspondences(self, least: int) -> SampleIndex:
+        """Only the samples with at least so many. Raises `BadInput` where there are samples, but no such ones."""
+        enough = self.correspondences >= least
+        if enough.all():
+            return self
+        if not enough.any():
+            most = int(self.correspondences.max())
+            raise BadInput(
+                f"none of its {len(self):,} pairs has {least} correspondences; the most are {most}",
+                where=self.storage.where("index.parquet"),
+                remedy=f"Use --set data.min_correspondences={most}, or prepare more overlapping views "
+                "(`dope prep correspond`)"
+                if most
+                else "Prepare other views: `dope prep status` says why pairs have no correspondences",
+            )
+        columns = ("keys", "shards", "sequences", "offsets", "sizes", "correspondences", "objects")
+        kept = {name: getattr(self, name)[enough] for name in columns}
+        return replace(self, left_out=self.left_out + int((~enough).sum()), **kept)
+
+
+def read_index(shards: Shards, split: str) -> SampleIndex:
     """Read `index.parquet` and `dataset.json` and check that the shards of a split are those they describe.
 
     Presence, size and the first sample of each shard are checked, not every byte (`verify_hashes` does).
@@ -55,100 +83,115 @@ def read_index(folder: Path, split: str) -> SampleIndex:
     Raises:
         BadInput: a file is missing, cut off, or of another dataset; the message names it and what to do.
     """
-    manifest = read_manifest(folder)
-    table = read_table(folder / "index.parquet", COLUMNS)
-    recorded = files.read_json(folder / "dataset.json").get("tables", {}).get("index.parquet")
-    if recorded is not None and files.sha256_of(folder / "index.parquet") != recorded:
-        raise BadInput("is not the one of dataset.json", where=folder / "index.parquet", remedy=REMAKE)
+    storage = open_storage(shards)
+    sizes = storage.sizes()
+    manifest = read_manifest(storage, sizes)
+    table, digest = read_table(storage, "index.parquet", COLUMNS)
+    recorded = storage.read_json("dataset.json").get("tables", {}).get("index.parquet")
+    if recorded is not None and digest != recorded:
+        raise BadInput("is not the one of dataset.json", where=storage.where("index.parquet"), remedy=REMAKE)
     sequences = np.unique(table["sequence"].to_numpy(zero_copy_only=False).astype(str))
     table = table.filter(pc.equal(table["split"], split))
     columns = {name: table[name].to_numpy(zero_copy_only=False) for name in COLUMNS}
     names = columns["sequence"].astype(str)
     index = SampleIndex(
-        folder=folder,
+        storage=storage,
         keys=columns["key"].astype(str),
         shards=columns["shard"].astype(str),
         sequences=names,
         offsets=columns["offset"].astype(np.int64),
         sizes=columns["size"].astype(np.int64),
+        correspondences=columns["n_correspondences"].astype(np.int64),
         objects=np.searchsorted(sequences, names),
         fingerprint=_fingerprint({name: manifest[name]["sha256"] for name in sorted(manifest) if _is_of(name, split)}),
     )
-    _check_shards(index, manifest, split)
+    _check_shards(index, manifest, sizes, split)
     return index
 
 
-def read_manifest(folder: Path) -> dict[str, dict[str, Any]]:
-    """The shards that `dataset.json` lists: name -> {"sha256", "bytes", "samples"}."""
-    if not folder.is_dir():
-        raise BadInput("no such folder", where=folder, remedy="SHARDS is what `dope prep shards --out` wrote")
-    path = folder / "dataset.json"
-    if not path.is_file():
+def read_manifest(storage: Storage, files: dict[str, int]) -> dict[str, dict[str, Any]]:
+    """The shards that `dataset.json` lists: name -> {"sha256", "bytes", "samples"}; `files` is what is there."""
+    if "dataset.json" not in files:
         raise BadInput(
             "is no folder of shards: it has no dataset.json",
-            where=folder,
-            remedy="SHARDS is what `dope prep shards --out` wrote; dataset.json is written last, so an interrupted run "
-            "must be run again",
+            where=storage.address,
+            remedy=f"{REMEDY}; dataset.json is written last, so an interrupted run must be run again",
         )
-    shards = files.read_json(path).get("shards")
+    shards = storage.read_json("dataset.json").get("shards")
     if not isinstance(shards, dict) or not all(isinstance(s, dict) and "sha256" in s for s in shards.values()):
-        raise BadInput("lists no shards", where=path, remedy=REMAKE)
+        raise BadInput("lists no shards", where=storage.where("dataset.json"), remedy=REMAKE)
     return shards
 
 
-def verify_hashes(folder: Path, split: str | None = None) -> None:
+def verify_hashes(shards: Shards, split: str | None = None) -> None:
     """Read every shard (of a split) whole and compare its SHA-256. Raises `BadInput` naming the first that differs."""
-    for name, entry in read_manifest(folder).items():
-        if (split is None or _is_of(name, split)) and files.sha256_of(folder / name) != entry["sha256"]:
-            raise BadInput("its SHA-256 is not the one in dataset.json", where=folder / name, remedy=REMAKE)
+    storage = open_storage(shards)
+    for name, entry in read_manifest(storage, storage.sizes()).items():
+        if (split is None or _is_of(name, split)) and storage.sha256(name) != entry["sha256"]:
+            raise BadInput("its SHA-256 is not the one in dataset.json", where=storage.where(name), remedy=REMAKE)
 
 
-def read_table(path: Path, columns: Sequence[str]) -> pa.Table:
-    """A Parquet file that has these columns. Raises `BadInput` where it is absent, damaged or lacks one."""
+def read_table(storage: Storage, name: str, columns: Sequence[str]) -> tuple[pa.Table, str]:
+    """A Parquet file that has these columns, and its SHA-256.
+
+    Raises:
+        BadInput: it is absent, damaged or lacks a column.
+    """
+    data = storage.read_bytes(name)
     try:
-        table = pq.read_table(path)
-    except FileNotFoundError:
-        raise BadInput("no such file", where=path, remedy=REMAKE) from None
+        table = pq.read_table(pa.BufferReader(data))
     except (pa.ArrowException, OSError) as error:
-        raise BadInput(f"cannot be read ({error})", where=path, remedy=REMAKE) from error
-    missing = [name for name in columns if name not in table.column_names]
+        raise BadInput(f"cannot be read ({error})", where=storage.where(name), remedy=REMAKE) from error
+    missing = [column for column in columns if column not in table.column_names]
     if missing:
-        raise BadInput(f"lacks the columns {', '.join(missing)}", where=path, remedy=REMAKE)
-    return table
+        raise BadInput(f"lacks the columns {', '.join(missing)}", where=storage.where(name), remedy=REMAKE)
+    return table, hashlib.sha256(data).hexdigest()
 
 
-def _check_shards(index: SampleIndex, manifest: dict[str, dict[str, Any]], split: str) -> None:
-    """Each shard of the split is there, has its size and its number of samples, and starts with the right sample."""
+def _check_shards(index: SampleIndex, manifest: dict[str, dict[str, Any]], sizes: dict[str, int], split: str) -> None:
+    """Each shard of the split is there, has its size and its number of samples, and holds the samples of the index."""
     indexed, first, counts = np.unique(index.shards, return_index=True, return_counts=True)
     samples = dict(zip(indexed.tolist(), counts.tolist(), strict=True))
     listed = [name for name in manifest if _is_of(name, split)]
+    ends = np.zeros(len(indexed), np.int64)
+    np.maximum.at(ends, np.searchsorted(indexed, index.shards), index.offsets + index.sizes)
+    needed = dict(zip(indexed.tolist(), ends.tolist(), strict=True))
     for name in sorted({*listed, *samples}):
-        path = index.folder / name
+        where = index.storage.where(name)
         if name not in manifest:
-            raise BadInput("is in index.parquet but not in dataset.json", where=path, remedy=REMAKE)
-        if not path.is_file():
-            raise BadInput("this shard is missing", where=path, remedy=REMAKE)
-        size, expected = path.stat().st_size, manifest[name].get("bytes")
+            raise BadInput("is in index.parquet but not in dataset.json", where=where, remedy=REMAKE)
+        if name not in sizes:
+            raise BadInput("this shard is missing", where=where, remedy=REMAKE)
+        size, expected = sizes[name], manifest[name].get("bytes")
         if expected is not None and size != expected:
             state = "is cut off" if size < expected else "is of another dataset"
-            raise BadInput(f"{state}: {size:,} bytes instead of {expected:,}", where=path, remedy=REMAKE)
+            raise BadInput(f"{state}: {size:,} bytes instead of {expected:,}", where=where, remedy=REMAKE)
         if manifest[name].get("samples", samples.get(name, 0)) != samples.get(name, 0):
             raise BadInput(
                 f"index.parquet has {samples.get(name, 0)} samples of it, dataset.json {manifest[name]['samples']}",
-                where=path,
+                where=where,
                 remedy=REMAKE,
             )
-    ends = np.zeros(len(indexed), np.int64)
-    np.maximum.at(ends, np.searchsorted(indexed, index.shards), index.offsets + index.sizes)
-    reader = ShardReader(index.folder)
-    for name, row, end in zip(indexed.tolist(), first.tolist(), ends.tolist(), strict=True):
-        size = (index.folder / name).stat().st_size
-        if size < end:
-            raise BadInput(
-                f"is cut off: {size:,} bytes, its samples need {end:,}", where=reader.folder / name, remedy=REMAKE
-            )
-        reader.sample(name, int(index.offsets[row]), int(index.sizes[row]), str(index.keys[row]))
-        reader.close()
+        if size < needed.get(name, 0):
+            what = f"is cut off: {size:,} bytes, its samples need {needed[name]:,}"
+            raise BadInput(what, where=where, remedy=REMAKE)
+    _check_samples(index, first)
+
+
+def _check_samples(index: SampleIndex, first: NDArray[np.integer]) -> None:
+    """The shards' first samples are where the index says, or where one is damaged, the shard's last one."""
+    last = {name: row for row, name in enumerate(index.shards.tolist())}
+    reader = ShardReader(index.storage)
+    for start in range(0, len(first), CHECKED_TOGETHER):
+        rows = first[start : start + CHECKED_TOGETHER].tolist()
+        for row, members in zip(rows, reader.samples([index.location(row) for row in rows]), strict=True):
+            if isinstance(members, OtherSample):
+                raise members
+            if isinstance(members, BadInput):
+                (other,) = reader.samples([index.location(last[str(index.shards[row])])])
+                if isinstance(other, BadInput):
+                    raise members
+    reader.close()
 
 
 def _is_of(shard: str, split: str) -> bool:

@@ -26,6 +26,7 @@ class TrainState:
         step: optimiser steps done.
         place: place in the order of samples.
         validation: newest result of `dope.validation.pck`, and that of the untrained network.
+        damaged: keys of the damaged samples that were met.
     """
 
     network: DopeNetwork
@@ -35,6 +36,7 @@ class TrainState:
     place: Place = field(default_factory=Place)
     validation: dict[str, float] | None = None
     untrained: dict[str, float] | None = None
+    damaged: set[str] = field(default_factory=set)
 
 
 def new_state(config: TrainConfig, ranks: Ranks) -> TrainState:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import io
 import signal
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import replace
+from itertools import cycle
 from typing import Any
 
 import cv2
@@ -15,93 +14,133 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset
 
-from dope.batch import PairBatch
+from dope.batch import DamagedSample, PairBatch
 from dope.common.errors import BadInput, DopeError
+from dope.decoding import DecodedPair, decode_pair
 from dope.shard_index import SampleIndex, read_index
 from dope.stop_signals import STOP_SIGNALS
+from dope.storage import Shards
 from dope.tar_samples import REMAKE, ShardReader
 
-
-@dataclass(frozen=True)
-class DecodedPair:
-    """One sample: images (S, S, 3) uint8 RGB, masks (S, S) bool, points (N, 4) float32, its object's number and key."""
-
-    images: tuple[NDArray[np.uint8], NDArray[np.uint8]]
-    masks: tuple[NDArray[np.bool_], NDArray[np.bool_]]
-    points: NDArray[np.float32]
-    object: int
-    key: str
+ALL_FOUR = 0x01010101
+"""Four bools that are True, as one number: NumPy's `all` over so short an axis takes twenty times as long."""
 
 
 class PairDataset(Dataset):
     """The view pairs of one split of a folder of shards, decoded by row.
 
     Args:
-        shards: the folder.
+        shards: the folder, or an fsspec URL of it.
         split: `train` or `val`.
         image_size: side of the decoded images; views of another size are resized and their points scaled.
         max_points: correspondences read of a pair.
+        min_correspondences: pairs with fewer are left out.
 
     Raises:
-        BadInput: the shards are not those that the index describes (see `read_index`).
+        BadInput: the shards are not those that the index describes (see `read_index`), or no pair has enough
+            correspondences.
     """
 
-    def __init__(self, shards: Path, split: str, *, image_size: int = 224, max_points: int = 4096) -> None:
-        self.index: SampleIndex = read_index(shards, split)
+    def __init__(
+        self,
+        shards: Shards,
+        split: str,
+        *,
+        image_size: int = 224,
+        max_points: int = 4096,
+        min_correspondences: int = 0,
+    ) -> None:
+        self.index: SampleIndex = read_index(shards, split).with_correspondences(min_correspondences)
         self.image_size, self.max_points = image_size, max_points
-        self._reader = ShardReader(shards)
+        self._reader = ShardReader(self.index.storage)
 
     def __len__(self) -> int:
         return len(self.index)
 
     def __getitem__(self, row: int) -> DecodedPair:
-        index, shard = self.index, str(self.index.shards[row])
-        key = str(index.keys[row])
-        members = self._reader.sample(shard, int(index.offsets[row]), int(index.sizes[row]), key)
-        where = f"{index.folder / shard}, sample {key}"
-        image1, scale1 = self._image(members, "1.jpg", where)
-        image2, scale2 = self._image(members, "2.jpg", where)
-        points = _points(members, self.max_points, where) * np.concatenate([scale1, scale2])
-        masks = (self._mask(members, "1.png", where), self._mask(members, "2.png", where))
-        return DecodedPair((image1, image2), masks, points, int(index.objects[row]), key)
+        (pair,) = self.read([row])
+        if isinstance(pair, DamagedSample):
+            raise self.error(pair)
+        return pair
 
-    def _image(self, members: dict[str, bytes], name: str, where: str) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        image = _decoded(members, name, cv2.IMREAD_COLOR, where)
-        height, width = image.shape[:2]
-        scale = np.array([self.image_size / width, self.image_size / height], np.float32)
-        return np.asarray(cv2.cvtColor(resized(image, self.image_size), cv2.COLOR_BGR2RGB), np.uint8), scale
+    def read(self, rows: Sequence[int]) -> list[DecodedPair | DamagedSample]:
+        """Read the samples of `rows` together, in few long reads, and decode each."""
+        return self._read(rows, *self._arrays(len(rows)))
 
-    def _mask(self, members: dict[str, bytes], name: str, where: str) -> NDArray[np.bool_]:
-        return resized(_decoded(members, name, cv2.IMREAD_GRAYSCALE, where), self.image_size) > 127
+    def batch(self, rows: Sequence[int]) -> PairBatch:
+        """The samples of `rows` as a batch, damaged ones filled in for.
 
+        A rank's share must keep its size, or the ranks' collectives would not fit. So a damaged sample's place is taken
+        by a good sample of the same share, all its points invalid: it has no part in the contrastive loss, and its
+        image counts once more in BatchNorm and in the mask loss. `damaged` of the batch says which. Without any good
+        sample, the images are black and the objects -1.
+        """
+        images, masks = self._arrays(len(rows))
+        pairs = self._read(rows, images, masks)
+        damaged = {place: pair for place, pair in enumerate(pairs) if isinstance(pair, DamagedSample)}
+        if len(damaged) == len(pairs):
+            images[:], masks[:] = 0, False
+        black = DecodedPair(
+            (images[0, 0], images[1, 0]), (masks[0, 0], masks[1, 0]), np.zeros((0, 4), np.float32), -1, ""
+        )
+        fill = cycle([pair for pair in pairs if isinstance(pair, DecodedPair)] or [black])
+        filled = []
+        for place, pair in enumerate(pairs):
+            if isinstance(pair, DamagedSample):
+                good = next(fill)
+                images[:, place], masks[:, place] = good.images, good.masks
+                pair = replace(good, points=good.points[:0])
+            filled.append(pair)
+        return replace(_batch_of(filled, images, masks), damaged=damaged)
 
-def resized(image: NDArray[Any], size: int | None) -> NDArray[Any]:
-    """The image as a square of `size` pixels, the same in training, evaluation and figures; as it is where None."""
-    if size is None or image.shape[:2] == (size, size):
-        return image
-    shrinks = min(image.shape[:2]) >= size
-    return cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    def error(self, sample: DamagedSample) -> BadInput:
+        """A damaged sample as an error."""
+        where = f"{self.index.storage.where(sample.shard)}, sample {sample.key}"
+        return BadInput(sample.reason, where=where, remedy=REMAKE)
+
+    def _arrays(self, n: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        side = self.image_size
+        return np.empty((2, n, 3, side, side), np.uint8), np.empty((2, n, side, side), bool)
+
+    def _read(
+        self, rows: Sequence[int], images: NDArray[np.uint8], masks: NDArray[np.bool_]
+    ) -> list[DecodedPair | DamagedSample]:
+        """Decode into arrays (2, B, 3, S, S) and (2, B, S, S): a batch needs no copy of what was decoded."""
+        locations = [self.index.location(row) for row in rows]
+        pairs: list[DecodedPair | DamagedSample] = []
+        for place, (at, members) in enumerate(zip(locations, self._reader.samples(locations), strict=True)):
+            try:
+                if isinstance(members, BadInput):
+                    raise members
+                out: dict[str, Any] = {"images": images[:, place], "masks": masks[:, place]}
+                number = int(self.index.objects[rows[place]])
+                pairs.append(decode_pair(members, number, at.key, max_points=self.max_points, where=at.shard, **out))
+            except BadInput as error:
+                pairs.append(DamagedSample(at.shard, at.key, error.what))
+        return pairs
 
 
 def collate(pairs: Sequence[DecodedPair]) -> PairBatch:
     """Stack decoded pairs; points are padded to the largest number in the batch (at least one row)."""
-    n_points = max(1, max(len(pair.points) for pair in pairs))
-    size = pairs[0].images[0].shape[0]
-    points = np.zeros((len(pairs), n_points, 4), np.float32)
-    valid = np.zeros((len(pairs), n_points), bool)
-    for row, pair in enumerate(pairs):
-        n = len(pair.points)
-        points[row, :n] = pair.points
-        # released data sets pad with -1: whatever lies outside an image is no correspondence
-        valid[row, :n] = (np.isfinite(pair.points) & (pair.points >= 0) & (pair.points < size)).all(axis=1)
+    images = np.stack([np.stack(pair.images) for pair in pairs], axis=1)
+    masks = np.stack([np.stack(pair.masks) for pair in pairs], axis=1)
+    return _batch_of(pairs, images, masks)
+
+
+def _batch_of(pairs: Sequence[DecodedPair], images: NDArray[np.uint8], masks: NDArray[np.bool_]) -> PairBatch:
+    size = images.shape[-1]
+    # released data sets pad with -1: whatever lies outside an image is no correspondence
+    points = np.full((len(pairs), max(1, *(len(pair.points) for pair in pairs)), 4), -1, np.float32)
+    for row, pair in zip(points, pairs, strict=True):
+        row[: len(pair.points)] = pair.points
+    inside = (points >= 0) & (points < size)  # NaN is neither
+    valid = inside.view(np.uint32)[..., 0] == ALL_FOUR
     points[~valid] = 0
-    images = [torch.from_numpy(np.stack([p.images[view] for p in pairs])).permute(0, 3, 1, 2) for view in (0, 1)]
-    masks = [torch.from_numpy(np.stack([p.masks[view] for p in pairs]))[:, None] for view in (0, 1)]
     return PairBatch(
-        images1=images[0].contiguous(),
-        images2=images[1].contiguous(),
-        masks1=masks[0],
-        masks2=masks[1],
+        images1=torch.from_numpy(images[0]),
+        images2=torch.from_numpy(images[1]),
+        masks1=torch.from_numpy(masks[0])[:, None],
+        masks2=torch.from_numpy(masks[1])[:, None],
         points=torch.from_numpy(points),
         valid=torch.from_numpy(valid),
         objects=torch.tensor([pair.object for pair in pairs], dtype=torch.int64),
@@ -113,21 +152,29 @@ class PairLoader:
     """Iterates over the batches of `rows`, in that order, whatever the number of workers.
 
     Args:
-        dataset: what is decoded.
+        dataset: what is decoded; a worker reads and decodes a whole batch at a time.
         rows: the sample rows of each batch; read lazily, a few batches ahead.
         workers: decoding processes; 0 decodes here.
         pin_memory: True for a CUDA device.
+        fill_damaged: hand out batches with damaged samples filled in for (see `PairDataset.batch`), for the caller to
+            look at; else the first damaged sample is an error.
     """
 
     def __init__(
-        self, dataset: PairDataset, rows: Iterable[list[int]], *, workers: int = 0, pin_memory: bool = False
+        self,
+        dataset: PairDataset,
+        rows: Iterable[list[int]],
+        *,
+        workers: int = 0,
+        pin_memory: bool = False,
+        fill_damaged: bool = False,
     ) -> None:
-        self._folder = dataset.index.folder
+        self._dataset, self._fill_damaged = dataset, fill_damaged
         self._loader = DataLoader(
-            _Explaining(dataset),
+            _Batches(dataset),
             batch_sampler=rows,
             num_workers=workers,
-            collate_fn=_collate_or_error,
+            collate_fn=_as_it_is,
             pin_memory=pin_memory,
             worker_init_fn=_quiet_worker,
             prefetch_factor=3 if workers else None,
@@ -139,38 +186,38 @@ class PairLoader:
             for batch in self._loader:
                 if isinstance(batch, DopeError):
                     raise batch
+                if batch.damaged and not self._fill_damaged:
+                    raise self._dataset.error(next(iter(batch.damaged.values())))
                 yield batch
         except RuntimeError as error:
             if "DataLoader worker" not in str(error):
                 raise
             raise DopeError(
                 f"a process that decodes samples died ({error})",
-                where=self._folder,
+                where=self._dataset.index.storage.address,
                 remedy="Memory or shared memory ran out: use --set data.workers=1, or in a container give "
                 "more shared memory (docker run --shm-size=4g)",
             ) from error
 
 
-class _Explaining(Dataset):
-    """Hands errors over as values: DataLoader would turn them into a traceback text."""
+class _Batches(Dataset):
+    """A batch for a list of rows. Errors are handed over as values: DataLoader would turn them into a traceback."""
 
     def __init__(self, dataset: PairDataset) -> None:
         self.dataset = dataset
 
-    def __getitem__(self, row: int) -> DecodedPair | DopeError:
+    def __getitem__(self, row: int) -> PairBatch | DopeError:
+        return self.__getitems__([row])
+
+    def __getitems__(self, rows: list[int]) -> PairBatch | DopeError:
         try:
-            return self.dataset[row]
+            return self.dataset.batch(rows)
         except DopeError as error:
             return error
 
 
-def _collate_or_error(pairs: list[DecodedPair | DopeError]) -> PairBatch | DopeError:
-    decoded = []
-    for pair in pairs:
-        if isinstance(pair, DopeError):
-            return pair
-        decoded.append(pair)
-    return collate(decoded)
+def _as_it_is(batch: Any) -> Any:
+    return batch
 
 
 def _quiet_worker(_: int) -> None:
@@ -179,24 +226,3 @@ def _quiet_worker(_: int) -> None:
     # says so or when their parent is gone
     for number in STOP_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
-
-
-def _decoded(members: dict[str, bytes], name: str, flags: int, where: str) -> NDArray[np.uint8]:
-    if name not in members:
-        raise BadInput(f"has no {name}", where=where, remedy=REMAKE)
-    image = cv2.imdecode(np.frombuffer(members[name], np.uint8), flags) if members[name] else None
-    if image is None:
-        raise BadInput(f"{name} cannot be decoded", where=where, remedy=REMAKE)
-    return image  # type: ignore[return-value]
-
-
-def _points(members: dict[str, bytes], max_points: int, where: str) -> NDArray[np.float32]:
-    try:
-        points = np.load(io.BytesIO(members["corr.npy"]), allow_pickle=False)
-    except KeyError:
-        raise BadInput("has no corr.npy", where=where, remedy=REMAKE) from None
-    except (ValueError, EOFError, OSError) as error:
-        raise BadInput(f"corr.npy cannot be read ({error})", where=where, remedy=REMAKE) from error
-    if points.ndim != 2 or points.shape[1] != 4 or points.dtype.kind != "f":
-        raise BadInput(f"corr.npy is {points.dtype} {points.shape}, not float32 (N, 4)", where=where, remedy=REMAKE)
-    return points[:max_points].astype(np.float32)

@@ -2,36 +2,26 @@
 
 from __future__ import annotations
 
-import copy
-import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dope import checkpoints, guard
-from dope.augmentation import no_augmentation
-from dope.batch import PairBatch
-from dope.common import files, settings
-from dope.common.errors import BadInput, DopeError
-from dope.config import TrainConfig, check, write_config
-from dope.distributed import Ranks, ranks_of
-from dope.figures.held_out import held_out_sheet
+from dope import damage, guard
+from dope.common import files
+from dope.config import TrainConfig, check
+from dope.distributed import ranks_of
 from dope.heap import keep_heap
 from dope.meter import Meter
-from dope.networks.untrained import settle_batchnorm
-from dope.order import SampleOrder
 from dope.profiling import StepProfiler
-from dope.run_logging import RunLog, SilentLog, describe_start
-from dope.state import TrainState, learning_rate, new_state, total_steps, wrap
+from dope.run import open_run
+from dope.state import learning_rate, wrap
 from dope.step import compute_losses, sample_batch
 from dope.stop_signals import StopRequest
-from dope.streaming import PairDataset, PairLoader
-from dope.validation import evaluating, pck
-from dope.wandb_run import require_wandb
+from dope.storage import Shards
+from dope.streaming import PairLoader
 
 
 def train(
-    shards: Path,
+    shards: Shards,
     out: Path,
     config: TrainConfig,
     *,
@@ -42,7 +32,7 @@ def train(
     """Train on SHARDS and leave checkpoints, settings and metrics in the folder `out`.
 
     Args:
-        shards: folder of shards; split `train` is trained on, split `val` validates.
+        shards: folder of shards, or an fsspec URL of it; split `train` is trained on, split `val` validates.
         out: the run's folder: config.yaml, checkpoints/, metrics.jsonl, tensorboard/.
         config: all settings (see `dope.config.load_config`).
         resume: `auto` goes on where `out` stopped, or begins, and passes over damaged checkpoints; `never` insists on
@@ -52,10 +42,12 @@ def train(
 
     Returns:
         `status` (finished, or stopped by a signal or `stop_after`), `step`, `steps_of_this_call`, `epoch`, `loss`,
-        `pck`, `pck_untrained`, `mask_iou`, `checkpoint`, `seconds`, `pairs_per_second`; None where there is none.
+        `pck`, `pck_untrained`, `mask_iou`, `damaged` (samples), `checkpoint`, `seconds`, `pairs_per_second`; None
+        where there is none.
 
     Raises:
-        BadInput: shards or checkpoint missing or damaged. UsageError: settings that do not fit them.
+        BadInput: shards or checkpoint missing or damaged, or more samples than `data.max_bad_samples` are.
+        UsageError: settings that do not fit them.
         DopeError: loss or gradient are not finite (the message names the step and the samples), or the disk is full.
     """
     check(config)
@@ -66,7 +58,8 @@ def train(
         if stop_after is not None:
             last_step = min(last_step, state.step + stop_after)
         rows = run.order.batches(state.place, config.schedule.epochs, rank=ranks.rank, world=ranks.world)
-        loader = PairLoader(run.dataset, rows, workers=config.data.workers, pin_memory=ranks.device.type == "cuda")
+        pin = ranks.device.type == "cuda"
+        loader = PairLoader(run.dataset, rows, workers=config.data.workers, pin_memory=pin, fill_damaged=True)
         online, meter = wrap(state.network, ranks), Meter(state.step)
         with run.begin() as log, StepProfiler(out, profile, ranks, log.say) as profiler:
             stopping = state.step >= last_step
@@ -75,9 +68,9 @@ def train(
                 for group in state.optimiser.param_groups:
                     group["lr"] = lr
                 sampled = sample_batch(batch.to(ranks.device), config, state.step, ranks.rank)
-                losses = compute_losses(
-                    online, state.momentum, sampled, config, ranks, step=state.step, stop=stop.requested
-                )
+                news = stop.requested or bool(batch.damaged)
+                losses = compute_losses(online, state.momentum, sampled, config, ranks, step=state.step, stop=news)
+                asked_to_stop = losses.stop and damage.heed(run, stop.requested, batch, log)
                 state.optimiser.zero_grad(set_to_none=True)
                 losses.backward.backward()
                 report = {**losses.report, "grad_norm": guard.gradient_norm(state.network.parameters()), "lr": lr}
@@ -86,180 +79,10 @@ def train(
                 state.momentum.update(state.network)
 
                 state.step, state.place = state.step + 1, run.order.after(state.place)
-                stopping = losses.stop or state.step >= last_step
+                stopping = asked_to_stop or state.step >= last_step
                 meter.add(config.data.batch_size, report["loss"])
                 profiler.step()
                 run.after_step(report, meter, log, stopping=stopping)
                 if stopping:
                     break
             return run.end(meter, log)
-
-
-@dataclass
-class Run:
-    """What a call of `train` works on, and what it does besides the steps themselves.
-
-    Attributes:
-        held_out: this rank's share of the validation pairs.
-        resumed_from: the checkpoint that it goes on from, or None.
-        damaged: what is wrong with newer checkpoints that were passed over.
-    """
-
-    out: Path
-    config: TrainConfig
-    ranks: Ranks
-    dataset: PairDataset
-    order: SampleOrder
-    held_out: list[PairBatch]
-    state: TrainState
-    resumed_from: Path | None
-    damaged: list[BadInput]
-
-    @property
-    def total_steps(self) -> int:
-        """Steps of the whole run."""
-        return total_steps(self.config, self.order.steps_per_epoch)
-
-    def is_due(self, every: int, every_steps: int = 0) -> bool:
-        """True at the end of each `every`-th epoch and after each `every_steps`-th step; never for 0."""
-        epoch_is_over = self.state.place.consumed == 0
-        return (every > 0 and epoch_is_over and self.state.place.epoch % every == 0) or (
-            every_steps > 0 and self.state.step % every_steps == 0
-        )
-
-    def begin(self) -> RunLog | SilentLog:
-        """Write the settings, open the log, say what is trained, and validate the untrained network."""
-        step, epoch, config = self.state.step, self.state.place.epoch, self.config
-        log: RunLog | SilentLog = SilentLog()
-        if self.ranks.is_first:
-            write_config(self.out / "config.yaml", config)
-            for folder in (self.out, self.out / "checkpoints"):
-                files.clear_leftovers(folder)
-            plain = settings.to_dict(config)
-            log = RunLog(self.out, start=step, total=self.total_steps, wandb=config.log.wandb, config=plain)
-        facts = self.facts()
-        log.say(describe_start(facts))
-        log.event("start", step, epoch, facts)
-        for error in self.damaged:
-            log.say(f"WARNING: {error.where}: {error.what}. Going on from an older one, {self.resumed_from}")
-            log.event("damaged_checkpoint", step, epoch, {"file": error.where, "reason": error.what})
-        if step == 0:
-            self.validate(log)
-            self.state.untrained = self.state.validation
-        return log
-
-    def facts(self) -> dict[str, Any]:
-        """What is trained on what, from where to where."""
-        return {
-            "pairs": len(self.dataset),
-            "objects": self.order.n_objects,
-            "batch_size": self.config.data.batch_size,
-            "steps_per_epoch": self.order.steps_per_epoch,
-            "total_steps": self.total_steps,
-            "parameters": sum(parameter.numel() for parameter in self.state.network.parameters()),
-            "precision": self.config.precision,
-            "world": self.ranks.world,
-            "device": str(self.ranks.device),
-            "config_hash": settings.config_hash(self.config),
-            "dataset": self.dataset.index.fingerprint,
-            "resumed_from": None if self.resumed_from is None else str(self.resumed_from),
-            "resumed_at": self.state.step,
-        }
-
-    def after_step(self, report: dict[str, float], meter: Meter, log: RunLog | SilentLog, *, stopping: bool) -> None:
-        """What is due after a step: progress, a line of metrics, validation, a checkpoint."""
-        step, policy = self.state.step, self.config.checkpoint
-        log.progress(step, meter)
-        if stopping or step % self.config.log.every == 0:
-            speed = {"pairs_per_second": round(meter.pairs_per_second, 2), "data_wait": round(meter.data_wait, 4)}
-            log.event("step", step, self.state.place.epoch, {**report, **speed})
-        is_best = False
-        if step == self.total_steps or self.is_due(self.config.validation.every):
-            is_best = self.validate(log) and policy.keep_best
-        if stopping or is_best or self.is_due(policy.every, policy.every_steps):
-            self.save(log, is_best=is_best)
-
-    def validate(self, log: RunLog | SilentLog) -> bool:
-        """PCK and mask IoU on all ranks' held-out pairs, logged, drawn and kept for the checkpoint.
-
-        Returns:
-            Whether the PCK is higher than that of the run's best checkpoint.
-        """
-        if self.config.validation.every == 0:
-            return False
-        network, step = self.state.network, self.state.step
-        if step == 0:  # random weights without the statistics of real images would be no baseline at all
-            network = copy.deepcopy(network)
-            images = (no_augmentation(batch.to(self.ranks.device)).images1 for batch in self.held_out)
-            settle_batchnorm(network, images)
-        self.ranks.copy_from_first(network)  # the ranks' BatchNorm statistics differ by their last batch
-        result = pck(network, self.held_out, points=self.config.data.points, ranks=self.ranks)
-        if result["pairs"] == 0:
-            if step == 0:
-                log.say("no held-out pairs (split val): nothing is validated")
-            return False
-        self.state.validation = result
-        log.event("validation", step, self.state.place.epoch, result)
-        if self.ranks.is_first and self.config.log.pictures:
-            title, device = f"held-out pairs at step {step}", self.ranks.device
-            with evaluating(network):
-                sheet = held_out_sheet(network, self.held_out, self.config.log.pictures, title=title, device=device)
-            if sheet is not None:
-                log.picture("validation/pairs", step, sheet)
-        return result["pck"] > checkpoints.best_pck(self.out, before=step)
-
-    def save(self, log: RunLog | SilentLog, *, is_best: bool = False) -> None:
-        """Write a checkpoint on the first rank."""
-        if self.ranks.is_first:
-            best_pck = self.state.validation["pck"] if is_best and self.state.validation else None
-            fingerprint = self.dataset.index.fingerprint
-            path = checkpoints.save_checkpoint(self.out, self.state, self.config, fingerprint, best_pck=best_pck)
-            log.event("checkpoint", self.state.step, self.state.place.epoch, {"file": path.name, "best": is_best})
-
-    def end(self, meter: Meter, log: RunLog | SilentLog) -> dict[str, Any]:
-        """The result of `train`, once all ranks are done."""
-        self.ranks.wait()
-        newest = checkpoints.latest_checkpoint(self.out)
-        result = {
-            "status": "finished" if self.state.step >= self.total_steps else "stopped",
-            "step": self.state.step,
-            "steps_of_this_call": self.state.step - meter.first_step,
-            "epoch": self.state.place.epoch,
-            "loss": None if math.isnan(meter.loss) else meter.loss,  # a finished run has nothing left to measure
-            "pck": (self.state.validation or {}).get("pck"),
-            "pck_untrained": (self.state.untrained or {}).get("pck"),
-            "mask_iou": (self.state.validation or {}).get("mask_iou"),
-            "checkpoint": None if newest is None else str(newest),
-            "seconds": round(meter.seconds, 1),
-            "pairs_per_second": round(meter.pairs_per_second, 2),
-        }
-        log.event("end", self.state.step, self.state.place.epoch, result)
-        return result
-
-
-def open_run(shards: Path, out: Path, config: TrainConfig, ranks: Ranks, resume: str | Path) -> Run:
-    """Check the shards, make the network, and go back to where the run stopped; nothing is written yet."""
-    if config.log.wandb:
-        require_wandb()
-    data = config.data
-    dataset = PairDataset(shards, "train", image_size=data.image_size, max_points=data.max_points)
-    order = SampleOrder(
-        dataset.index.objects, data.batch_size, pairs_per_object=data.pairs_per_object, seed=config.seed
-    )
-    held_out = read_held_out(shards, config, ranks)
-    state = new_state(config, ranks)
-    found, damaged = checkpoints.go_on_from(resume, out, state, config, dataset.index.fingerprint)
-    if len(set(ranks.collect(state.step))) > 1:
-        what = "the ranks do not see the same checkpoints"
-        raise DopeError(what, where=out / "checkpoints", remedy="All machines must share this folder")
-    return Run(out, config, ranks, dataset, order, held_out, state, found, damaged)
-
-
-def read_held_out(shards: Path, config: TrainConfig, ranks: Ranks) -> list[PairBatch]:
-    """This rank's share of the validation pairs, decoded once and kept; empty without validation or split `val`."""
-    if config.validation.every == 0:
-        return []
-    dataset = PairDataset(shards, "val", image_size=config.data.image_size, max_points=config.data.points)
-    mine = list(range(min(config.validation.pairs, len(dataset))))[ranks.rank :: ranks.world]
-    size = config.validation.batch_size
-    return list(PairLoader(dataset, [mine[i : i + size] for i in range(0, len(mine), size)]))

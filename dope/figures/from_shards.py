@@ -17,13 +17,14 @@ from dope.figures.heatmap import Point, similarity_heatmap
 from dope.lowshot.views import ViewShards
 from dope.networks import DopeNetwork, NetworkConfig
 from dope.networks.untrained import untrained_network
+from dope.storage import Shards
 
 Kind = Literal["colouring", "heatmap"]
 
 
 def draw_figures(
     checkpoint: Path | None,
-    shards: Path,
+    shards: Shards,
     out: Path,
     *,
     kind: Kind = "colouring",
@@ -39,7 +40,7 @@ def draw_figures(
 
     Args:
         checkpoint: a checkpoint or a run's folder; None shows random weights, for comparison.
-        shards: a folder of shards.
+        shards: a folder of shards, or an fsspec URL of it.
         out: the folder for `<sequence>-<kind>.png`.
         kind: colours carried from the first view, or where a point of it is found again.
         sequences: their ids; None takes the first `limit`, held-out ones first.
@@ -90,7 +91,7 @@ def draw_figures(
         raise failed[0]
 
 
-def figure_for(shards: Path, checkpoint: Path | None, sequence: str, kind: Kind, out: Path, **options: Any) -> Path:
+def figure_for(shards: Shards, checkpoint: Path | None, sequence: str, kind: Kind, out: Path, **options: Any) -> Path:
     """Write the figure of one sequence into the folder `out` and return its path (options as in `draw_figures`)."""
     return next(draw_figures(checkpoint, shards, out, kind=kind, sequences=[sequence], **options))
 

@@ -12,9 +12,9 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
+from dope.decoding import resized
 from dope.figures.drawing import Image
 from dope.lowshot.encoding import to_tensor
-from dope.streaming import resized
 
 SURE = 0.5  # soft mask from which a pixel counts as the object
 

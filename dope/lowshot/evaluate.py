@@ -24,6 +24,7 @@ from dope.lowshot.results import ResultRow
 from dope.lowshot.views import ViewShards
 from dope.networks import DopeNetwork, NetworkConfig
 from dope.networks.untrained import settle_batchnorm, untrained_network
+from dope.storage import Shards
 
 SETTLING_VIEWS = 64
 """Views from which a network of random weights gets its BatchNorm statistics."""
@@ -72,7 +73,7 @@ class EvaluationResult:
 
 def evaluate(
     checkpoint: Path | None,
-    shards: Path,
+    shards: Shards,
     config: EvaluationConfig | None = None,
     *,
     network: NetworkConfig | None = None,

@@ -8,18 +8,17 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from hashlib import sha256
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dope.common import files
 from dope.common.errors import BadInput, UsageError
+from dope.decoding import resized
 from dope.shard_index import read_table
-from dope.streaming import resized
-from dope.tar_samples import REMAKE, ShardReader
+from dope.storage import Shards, Storage, open_storage
+from dope.tar_samples import REMAKE, Location, ShardReader
 
 COLUMNS = ("key", "shard", "offset", "size", "sequence", "instance", "category", "split", "frame")
 
@@ -37,17 +36,18 @@ class ViewShards:
     """The rows of SHARDS/views.parquet, and the views behind them.
 
     Attributes:
-        folder: where the shards lie.
+        folder: the path or URL where the shards lie.
         columns: the columns of views.parquet, each a list with one entry a view.
 
     Raises:
         BadInput: the folder or its views.parquet is absent, damaged or lacks columns, or has no views.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.columns = _read_columns(folder)
-        self._reader = ShardReader(folder)
+    def __init__(self, shards: Shards) -> None:
+        self._storage = open_storage(shards)
+        self.folder = self._storage.address
+        self.columns = _read_columns(self._storage)
+        self._reader = ShardReader(self._storage)
 
     def __len__(self) -> int:
         return len(self.columns["key"])
@@ -61,7 +61,7 @@ class ViewShards:
             info = json.loads(members["json"])
         except (KeyError, ValueError) as error:
             what = f"{self.columns['key'][index]}.json is missing or damaged"
-            raise BadInput(what, where=self.folder / self.columns["shard"][index], remedy=REMAKE) from error
+            raise BadInput(what, where=self._where(index), remedy=REMAKE) from error
         return View(np.ascontiguousarray(image[..., ::-1]), mask, info)
 
     def image(self, index: int) -> NDArray[np.uint8]:
@@ -133,22 +133,24 @@ class ViewShards:
     def fingerprint(self) -> str:
         """16 hex digits that change whenever a view does: of the table and, where listed, the shards' hashes."""
         names = sorted(set(self.columns["shard"]))
-        manifest = self.folder / "dataset.json"
-        listed = files.read_json(manifest).get("shards", {}) if manifest.is_file() else {}
+        known = "dataset.json" in self._storage.sizes()
+        listed = self._storage.read_json("dataset.json").get("shards", {}) if known else {}
         hashes = [[name, listed.get(name, {}).get("sha256")] for name in names]
         table = [[self.columns[name][i] for name in COLUMNS] for i in range(len(self))]
         return sha256(json.dumps([hashes, table], default=str).encode()).hexdigest()[:16]
 
     def _members(self, index: int) -> dict[str, bytes]:
-        row = {name: self.columns[name][index] for name in ("shard", "offset", "size", "key")}
-        return self._reader.sample(**row)
+        return self._reader.sample(**{name: self.columns[name][index] for name in Location._fields})
+
+    def _where(self, index: int) -> str:
+        return self._storage.where(self.columns["shard"][index])
 
     def _decode(self, index: int, members: Mapping[str, bytes], name: str, flags: int) -> NDArray[Any]:
         data = members.get(name)
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
         if image is None:
             what = f"{self.columns['key'][index]}.{name} {'cannot be decoded' if data else 'is missing'}"
-            raise BadInput(what, where=self.folder / self.columns["shard"][index], remedy=REMAKE)
+            raise BadInput(what, where=self._where(index), remedy=REMAKE)
         return image
 
     def _batch(self, indices: Sequence[int] | NDArray[np.integer], image_size: int | None) -> NDArray[np.uint8]:
@@ -160,13 +162,11 @@ class ViewShards:
         return np.stack(images)
 
 
-def _read_columns(folder: Path) -> dict[str, list[Any]]:
-    if not folder.is_dir():
-        raise BadInput("no such folder", where=folder, remedy="SHARDS is what `dope prep shards --out` wrote")
-    path = folder / "views.parquet"
-    table = read_table(path, COLUMNS)
+def _read_columns(storage: Storage) -> dict[str, list[Any]]:
+    storage.sizes()  # is there such a folder at all?
+    table, _ = read_table(storage, "views.parquet", COLUMNS)
     if not len(table):
-        raise BadInput("has no views", where=path, remedy=REMAKE)
+        raise BadInput("has no views", where=storage.where("views.parquet"), remedy=REMAKE)
     return {name: column.to_pylist() for name, column in zip(table.column_names, table.columns, strict=True)}
 
 

@@ -1,24 +1,21 @@
-import io
 import json
 import os
 import shutil
 import subprocess
-import tarfile
 from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
 from tiny_shards import make_pair, write_shards
-from webdataset import TarWriter
 
 from dope.common.errors import BadInput, DopeError
 from dope.shard_index import read_index, verify_hashes
 from dope.streaming import PairDataset, PairLoader, collate
-from dope.tar_samples import ShardReader, split_members
 
 
 @pytest.fixture(scope="module")
@@ -31,39 +28,6 @@ def copy(shards: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(shards, tmp_path / "copy"))
 
 
-def test_members_equal_tarfile(shards: Path) -> None:
-    path = shards / "train-000000.tar"
-    with tarfile.open(path) as tar:
-        expected = {member.name: tar.extractfile(member).read() for member in tar}  # type: ignore[union-attr]
-    assert split_members(path.read_bytes(), "x") == expected
-
-
-@pytest.mark.parametrize("format", [tarfile.USTAR_FORMAT, tarfile.GNU_FORMAT, tarfile.PAX_FORMAT])
-def test_long_names_of_all_tar_formats(format: int) -> None:
-    names = ["short.1.jpg", "folder/" * 20 + "long.1.png", "x" * 95 + ".json"]
-    if format != tarfile.USTAR_FORMAT:
-        names += ["ä" * 80 + ".1.jpg", "y" * 300 + ".corr.npy"]
-    buffer = io.BytesIO()
-    with tarfile.open(fileobj=buffer, mode="w", format=format) as tar:
-        for i, name in enumerate(names):
-            info = tarfile.TarInfo(name)
-            info.size = 700 * i
-            tar.addfile(info, io.BytesIO(bytes([i]) * info.size))
-    assert split_members(buffer.getvalue(), "x") == {name: bytes([i]) * 700 * i for i, name in enumerate(names)}
-
-
-def test_a_damaged_header_and_a_cut_member_are_errors() -> None:
-    buffer = io.BytesIO()
-    with TarWriter(buffer, mtime=0, encoder=False) as tar:
-        tar.write({"__key__": "a", "jpg": b"1" * 2000})
-    data = bytearray(buffer.getvalue())
-    with pytest.raises(BadInput, match="cut off"):
-        split_members(bytes(data[:1500]), "shard.tar")
-    data[3] ^= 1
-    with pytest.raises(BadInput, match=r"shard\.tar: damaged tar header"):
-        split_members(bytes(data), "shard.tar")
-
-
 def test_decodes_what_was_written(shards: Path) -> None:
     dataset = PairDataset(shards, "train", image_size=64)
     assert len(dataset) == 12
@@ -73,7 +37,8 @@ def test_decodes_what_was_written(shards: Path) -> None:
     np.testing.assert_array_equal(decoded.points, made.points)
     for view in (0, 1):
         np.testing.assert_array_equal(decoded.masks[view], made.masks[view] > 0)
-        error = np.abs(decoded.images[view].astype(int) - cv2.cvtColor(made.images[view], cv2.COLOR_BGR2RGB))
+        written = cv2.cvtColor(made.images[view], cv2.COLOR_BGR2RGB).transpose(2, 0, 1)
+        error = np.abs(decoded.images[view].astype(int) - written)
         assert error.mean() < 6  # JPEG; swapped channels would be far off
 
 
@@ -87,14 +52,6 @@ def test_correspondences_of_the_helper_are_true() -> None:
     warped = cv2.warpAffine(made.images[0], warp, (96, 96)).astype(int)
     inside = cv2.erode(made.masks[1], np.ones((9, 9))) > 0
     assert np.abs(warped - made.images[1])[inside].mean() < 4
-
-
-def test_smaller_images_scale_points_and_shrink_by_area(shards: Path) -> None:
-    full, half = PairDataset(shards, "train", image_size=64)[0], PairDataset(shards, "train", image_size=32)[0]
-    np.testing.assert_allclose(half.points, full.points / 2)
-    blocks = full.images[0].reshape(32, 2, 32, 2, 3).mean((1, 3))
-    assert np.abs(half.images[0] - blocks).max() <= 1.0
-    assert half.masks[1].shape == (32, 32)
 
 
 def test_points_are_cut_to_max_points_and_padded_in_a_batch(shards: Path) -> None:
@@ -182,6 +139,33 @@ def drop_rows(folder: Path) -> None:
     pq.write_table(pq.read_table(folder / "index.parquet").slice(1), folder / "index.parquet")
 
 
+def garble_both_ends(folder: Path) -> None:
+    path = folder / "train-000001.tar"
+    path.write_bytes(b"\7" * path.stat().st_size)
+
+
+def beyond_the_end(folder: Path) -> None:
+    forget_hashes(folder)
+    table = pq.read_table(folder / "index.parquet")
+    offsets = [offset + (10**6 if i == 3 else 0) for i, offset in enumerate(table["offset"].to_pylist())]
+    table = table.set_column(table.schema.get_field_index("offset"), "offset", [offsets])
+    pq.write_table(table, folder / "index.parquet")
+
+
+def swapped_keys(folder: Path) -> None:
+    forget_hashes(folder)
+    table = pq.read_table(folder / "index.parquet")
+    keys = table["key"].to_pylist()
+    keys[0], keys[1] = keys[1], keys[0]
+    pq.write_table(table.set_column(table.schema.get_field_index("key"), "key", [keys]), folder / "index.parquet")
+
+
+def unlisted(folder: Path) -> None:
+    manifest = json.loads((folder / "dataset.json").read_text())
+    del manifest["shards"]["train-000001.tar"]
+    (folder / "dataset.json").write_text(json.dumps(manifest))
+
+
 def unfinished(folder: Path) -> None:
     (folder / "dataset.json").unlink()
 
@@ -201,6 +185,10 @@ def no_shards_listed(folder: Path) -> None:
         (drop_column, "index.parquet", "lacks the columns offset"),
         (another_index, "index.parquet", "is not the one of dataset.json"),
         (drop_rows, "train-000000.tar", "9 samples of it, dataset.json 10"),
+        (garble_both_ends, "train-000001.tar", "damaged tar header"),
+        (beyond_the_end, "train-000000.tar", "is cut off: .* its samples need"),
+        (swapped_keys, "train-000000.tar", "different datasets"),
+        (unlisted, "train-000001.tar", "in index.parquet but not in dataset.json"),
         (unfinished, "copy", "no dataset.json"),
         (no_shards_listed, "dataset.json", "lists no shards"),
     ],
@@ -213,6 +201,14 @@ def test_damage_is_found_before_training_and_named(
         PairDataset(copy, "train")
     assert Path(str(caught.value.where)).name == file
     assert caught.value.remedy
+
+
+def test_a_damaged_first_sample_is_left_to_the_training(copy: Path) -> None:
+    with (copy / "train-000000.tar").open("rb+") as file:
+        file.write(b"damage")
+    dataset = PairDataset(copy, "train", image_size=64)
+    with pytest.raises(BadInput, match=r"train-000000\.tar, sample object_000-0000: damaged tar header"):
+        dataset[0]
 
 
 def test_damage_inside_a_shard_is_found_by_its_hash(copy: Path) -> None:
@@ -240,32 +236,27 @@ def test_an_image_that_cannot_be_decoded_is_named_by_shard_and_key(copy: Path, w
 
 def test_a_worker_that_is_killed_is_explained(shards: Path) -> None:
     dataset = PairDataset(shards, "train", image_size=64)
-    dataset._reader.sample = lambda *_: os.kill(os.getpid(), 9)  # type: ignore[method-assign,assignment,return-value]
+    dataset._reader.samples = lambda *_: os.kill(os.getpid(), 9)  # type: ignore[method-assign,assignment,return-value]
     with pytest.raises(DopeError, match=r"process that decodes samples died .*data\.workers"):
         list(PairLoader(dataset, [[0, 1]], workers=1))
 
 
-def test_pickled_correspondences_are_refused(tmp_path: Path) -> None:
-    buffer = io.BytesIO()
-    np.save(buffer, np.array([object()]), allow_pickle=True)
-    folder = write_shards(tmp_path, n_objects=2, pairs=1)
-    dataset = PairDataset(folder, "train", image_size=64)
-    members = dataset._reader.sample(
-        str(dataset.index.shards[0]), int(dataset.index.offsets[0]), int(dataset.index.sizes[0]), "object_000-0000"
-    )
-    dataset._reader.sample = lambda *_: {**members, "corr.npy": buffer.getvalue()}  # type: ignore[method-assign]
-    with pytest.raises(BadInput, match=r"corr\.npy cannot be read"):
-        dataset[0]
-
-
-def test_a_reader_survives_pickling_after_it_opened_files(shards: Path) -> None:
-    import pickle
-
-    index, reader = read_index(shards, "train"), ShardReader(shards)
-    place = (str(index.shards[0]), int(index.offsets[0]), int(index.sizes[0]), str(index.keys[0]))
-    first = reader.sample(*place)
-    assert pickle.loads(pickle.dumps(reader)).sample(*place) == first
-    reader.close()
+def test_pairs_with_too_few_correspondences_are_left_out(copy: Path) -> None:
+    forget_hashes(copy)
+    table = pq.read_table(copy / "index.parquet")
+    counts = [n if i % 3 else i for i, n in enumerate(table["n_correspondences"].to_pylist())]
+    counts = pa.array(counts)
+    place = table.schema.get_field_index("n_correspondences")
+    pq.write_table(table.set_column(place, "n_correspondences", counts), copy / "index.parquet")
+    everything = PairDataset(copy, "train", image_size=64)
+    some = PairDataset(copy, "train", image_size=64, min_correspondences=4)
+    assert len(everything) == 12 and len(some) == 10 and some.index.left_out == 2  # rows 0 and 3 have 0 and 3
+    assert list(some.index.keys) == [key for i, key in enumerate(everything.index.keys) if i not in (0, 3)]
+    assert [some[row].key for row in (0, 9)] == [some.index.keys[0], some.index.keys[9]]
+    assert some.index.fingerprint == everything.index.fingerprint
+    assert len(PairDataset(copy, "train", image_size=64, min_correspondences=1)) == 11
+    with pytest.raises(BadInput, match=r"none of its 12 pairs has 999 correspondences.*data\.min_correspondences=\d+"):
+        PairDataset(copy, "train", min_correspondences=999)
 
 
 def test_no_such_folder(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import fsspec
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -108,6 +109,14 @@ def write_shards(
     manifest = {"counts": counts, "shards": shards, "tables": tables, "settings": {"seed": seed}, "versions": {}}
     (folder / "dataset.json").write_text(json.dumps(manifest, indent=1))
     return folder
+
+
+def to_memory(folder: Path, name: str) -> str:
+    """Copy SHARDS into fsspec's memory:// and return the URL."""
+    memory = fsspec.filesystem("memory")
+    for path in folder.iterdir():
+        memory.pipe_file(f"/{name}/{path.name}", path.read_bytes())
+    return f"memory://{name}"
 
 
 def _write_tar(

@@ -1,0 +1,221 @@
+"""What a call of `dope.trainer.train` works on: shards, network, place in the run, and what is due between steps."""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dope import checkpoints, damage
+from dope.augmentation import no_augmentation
+from dope.batch import DamagedSample, PairBatch
+from dope.common import files, settings
+from dope.common.errors import BadInput, DopeError
+from dope.config import TrainConfig, write_config
+from dope.distributed import Ranks
+from dope.figures.held_out import held_out_sheet
+from dope.meter import Meter
+from dope.networks.untrained import settle_batchnorm
+from dope.order import SampleOrder
+from dope.run_logging import RunLog, SilentLog, describe_start
+from dope.state import TrainState, new_state, total_steps
+from dope.storage import Shards
+from dope.streaming import PairDataset, PairLoader
+from dope.validation import evaluating, pck
+from dope.wandb_run import require_wandb
+
+
+@dataclass
+class Run:
+    """What a call of `train` works on, and what it does besides the steps themselves.
+
+    Attributes:
+        held_out: this rank's share of the validation pairs, and those of it that are damaged.
+        resumed_from: the checkpoint that it goes on from, or None.
+        damaged_checkpoints: what is wrong with newer checkpoints that were passed over.
+    """
+
+    out: Path
+    config: TrainConfig
+    ranks: Ranks
+    dataset: PairDataset
+    order: SampleOrder
+    held_out: list[PairBatch]
+    held_out_damaged: list[DamagedSample]
+    state: TrainState
+    resumed_from: Path | None
+    damaged_checkpoints: list[BadInput]
+
+    @property
+    def total_steps(self) -> int:
+        """Steps of the whole run."""
+        return total_steps(self.config, self.order.steps_per_epoch)
+
+    def is_due(self, every: int, every_steps: int = 0) -> bool:
+        """True at the end of each `every`-th epoch and after each `every_steps`-th step; never for 0."""
+        epoch_is_over = self.state.place.consumed == 0
+        return (every > 0 and epoch_is_over and self.state.place.epoch % every == 0) or (
+            every_steps > 0 and self.state.step % every_steps == 0
+        )
+
+    def begin(self) -> RunLog | SilentLog:
+        """Write the settings, open the log, say what is trained, and validate the untrained network."""
+        step, epoch, config = self.state.step, self.state.place.epoch, self.config
+        log: RunLog | SilentLog = SilentLog()
+        if self.ranks.is_first:
+            write_config(self.out / "config.yaml", config)
+            for folder in (self.out, self.out / "checkpoints"):
+                files.clear_leftovers(folder)
+            plain = settings.to_dict(config)
+            log = RunLog(self.out, start=step, total=self.total_steps, wandb=config.log.wandb, config=plain)
+        facts = self.facts()
+        log.say(describe_start(facts))
+        log.event("start", step, epoch, facts)
+        for error in self.damaged_checkpoints:
+            log.say(f"WARNING: {error.where}: {error.what}. Going on from an older one, {self.resumed_from}")
+            log.event("damaged_checkpoint", step, epoch, {"file": error.where, "reason": error.what})
+        damage.count(self, [one for some in self.ranks.collect(self.held_out_damaged) for one in some], log)
+        if step == 0:
+            self.validate(log)
+            self.state.untrained = self.state.validation
+        return log
+
+    def facts(self) -> dict[str, Any]:
+        """What is trained on what, from where to where."""
+        return {
+            "pairs": len(self.dataset),
+            "left_out": self.dataset.index.left_out,
+            "objects": self.order.n_objects,
+            "batch_size": self.config.data.batch_size,
+            "steps_per_epoch": self.order.steps_per_epoch,
+            "total_steps": self.total_steps,
+            "parameters": sum(parameter.numel() for parameter in self.state.network.parameters()),
+            "precision": self.config.precision,
+            "world": self.ranks.world,
+            "device": str(self.ranks.device),
+            "config_hash": settings.config_hash(self.config),
+            "dataset": self.dataset.index.fingerprint,
+            "resumed_from": None if self.resumed_from is None else str(self.resumed_from),
+            "resumed_at": self.state.step,
+        }
+
+    def after_step(self, report: dict[str, float], meter: Meter, log: RunLog | SilentLog, *, stopping: bool) -> None:
+        """What is due after a step: progress, a line of metrics, validation, a checkpoint."""
+        step, policy = self.state.step, self.config.checkpoint
+        log.progress(step, meter)
+        if stopping or step % self.config.log.every == 0:
+            speed = {"pairs_per_second": round(meter.pairs_per_second, 2), "data_wait": round(meter.data_wait, 4)}
+            log.event("step", step, self.state.place.epoch, {**report, **speed})
+        is_best = False
+        if step == self.total_steps or self.is_due(self.config.validation.every):
+            is_best = self.validate(log) and policy.keep_best
+        if stopping or is_best or self.is_due(policy.every, policy.every_steps):
+            self.save(log, is_best=is_best)
+
+    def validate(self, log: RunLog | SilentLog) -> bool:
+        """PCK and mask IoU on all ranks' held-out pairs, logged, drawn and kept for the checkpoint.
+
+        Returns:
+            Whether the PCK is higher than that of the run's best checkpoint.
+        """
+        if self.config.validation.every == 0:
+            return False
+        network, step = self.state.network, self.state.step
+        if step == 0:  # random weights without the statistics of real images would be no baseline at all
+            network = copy.deepcopy(network)
+            images = (no_augmentation(batch.to(self.ranks.device)).images1 for batch in self.held_out)
+            settle_batchnorm(network, images)
+        self.ranks.copy_from_first(network)  # the ranks' BatchNorm statistics differ by their last batch
+        result = pck(network, self.held_out, points=self.config.data.points, ranks=self.ranks)
+        if result["pairs"] == 0:
+            if step == 0:
+                log.say("no held-out pairs (split val): nothing is validated")
+            return False
+        self.state.validation = result
+        log.event("validation", step, self.state.place.epoch, result)
+        if self.ranks.is_first and self.config.log.pictures:
+            title, device = f"held-out pairs at step {step}", self.ranks.device
+            with evaluating(network):
+                sheet = held_out_sheet(network, self.held_out, self.config.log.pictures, title=title, device=device)
+            if sheet is not None:
+                log.picture("validation/pairs", step, sheet)
+        return result["pck"] > checkpoints.best_pck(self.out, before=step)
+
+    def save(self, log: RunLog | SilentLog, *, is_best: bool = False) -> None:
+        """Write a checkpoint on the first rank."""
+        if self.ranks.is_first:
+            best_pck = self.state.validation["pck"] if is_best and self.state.validation else None
+            fingerprint = self.dataset.index.fingerprint
+            path = checkpoints.save_checkpoint(self.out, self.state, self.config, fingerprint, best_pck=best_pck)
+            log.event("checkpoint", self.state.step, self.state.place.epoch, {"file": path.name, "best": is_best})
+
+    def end(self, meter: Meter, log: RunLog | SilentLog) -> dict[str, Any]:
+        """The result of `train`, once all ranks are done."""
+        self.ranks.wait()
+        newest = checkpoints.latest_checkpoint(self.out)
+        result = {
+            "status": "finished" if self.state.step >= self.total_steps else "stopped",
+            "step": self.state.step,
+            "steps_of_this_call": self.state.step - meter.first_step,
+            "epoch": self.state.place.epoch,
+            "loss": None if math.isnan(meter.loss) else meter.loss,  # a finished run has nothing left to measure
+            "pck": (self.state.validation or {}).get("pck"),
+            "pck_untrained": (self.state.untrained or {}).get("pck"),
+            "mask_iou": (self.state.validation or {}).get("mask_iou"),
+            "damaged": len(self.state.damaged),
+            "checkpoint": None if newest is None else str(newest),
+            "seconds": round(meter.seconds, 1),
+            "pairs_per_second": round(meter.pairs_per_second, 2),
+        }
+        log.event("end", self.state.step, self.state.place.epoch, result)
+        return result
+
+
+def open_run(shards: Shards, out: Path, config: TrainConfig, ranks: Ranks, resume: str | Path) -> Run:
+    """Check the shards, make the network, and go back to where the run stopped; nothing is written yet."""
+    if config.log.wandb:
+        require_wandb()
+    data = config.data
+    dataset = PairDataset(
+        shards,
+        "train",
+        image_size=data.image_size,
+        max_points=data.max_points,
+        min_correspondences=data.min_correspondences,
+    )
+    if not len(dataset):
+        where = dataset.index.storage.where("index.parquet")
+        raise BadInput("has no pairs for training", where=where, remedy="Hold out less: `dope prep shards --set`")
+    order = SampleOrder(
+        dataset.index.objects,
+        data.batch_size,
+        pairs_per_object=data.pairs_per_object,
+        seed=config.seed,
+        order=data.order,
+        block=data.block,
+    )
+    held_out, held_out_damaged = read_held_out(shards, config, ranks)
+    state = new_state(config, ranks)
+    found, damaged = checkpoints.go_on_from(resume, out, state, config, dataset.index.fingerprint)
+    if len(set(ranks.collect(state.step))) > 1:
+        what = "the ranks do not see the same checkpoints"
+        raise DopeError(what, where=out / "checkpoints", remedy="All machines must share this folder")
+    return Run(out, config, ranks, dataset, order, held_out, held_out_damaged, state, found, damaged)
+
+
+def read_held_out(shards: Shards, config: TrainConfig, ranks: Ranks) -> tuple[list[PairBatch], list[DamagedSample]]:
+    """This rank's share of the validation pairs, decoded once and kept, without the damaged ones, and these.
+
+    Empty without validation or split `val`.
+    """
+    if config.validation.every == 0:
+        return [], []
+    dataset = PairDataset(shards, "val", image_size=config.data.image_size, max_points=config.data.points)
+    mine = list(range(min(config.validation.pairs, len(dataset))))[ranks.rank :: ranks.world]
+    size = config.validation.batch_size
+    rows = [mine[i : i + size] for i in range(0, len(mine), size)]
+    batches = list(PairLoader(dataset, rows, fill_damaged=True))
+    whole = [batch.without_damaged() for batch in batches]
+    return [batch for batch in whole if len(batch)], [one for batch in batches for one in batch.damaged.values()]
