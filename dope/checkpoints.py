@@ -24,6 +24,7 @@ from dope.common.errors import BadInput, UsageError
 from dope.config import CheckpointConfig, TrainConfig, differing_keys
 from dope.networks import DopeNetwork, NetworkConfig
 from dope.order import Place
+from dope.preset_files import merged
 from dope.state import TrainState
 
 if TYPE_CHECKING:
@@ -191,7 +192,8 @@ def resume(path: Path, state: TrainState, config: TrainConfig, dataset: str) -> 
         UsageError: it was made with other settings (all that differ are named) or from other shards.
     """
     values = read_checkpoint(path, next(state.network.parameters()).device)
-    differing = differing_keys(settings.to_dict(config), values["config"])
+    # a setting younger than the checkpoint had its default's effect then
+    differing = differing_keys(settings.to_dict(config), merged(settings.to_dict(TrainConfig()), values["config"]))
     if differing:
         keys = "; ".join(f"{key} is {ours}, was {theirs}" for key, (ours, theirs) in differing.items())
         raise UsageError(

@@ -19,7 +19,7 @@ from dope.networks import NetworkConfig
 from dope.order import Order
 from dope.preset_files import merged, preset_values
 
-RESULT_NEUTRAL = ("data.workers", "data.max_bad_samples", "device", "validation", "checkpoint", "log", "log_every")
+RESULT_NEUTRAL = ("data.workers", "data.max_bad_samples", "device", "validation", "checkpoint", "log")
 """Settings that do not change what is learnt: a run may be resumed with other values of these."""
 
 
@@ -250,10 +250,9 @@ def check(config: TrainConfig) -> None:
 def differing_keys(ours: dict[str, Any], theirs: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
     """Settings that differ between two configs given as plain dicts: dotted key -> (ours, theirs).
 
-    Those of `RESULT_NEUTRAL` are left out. A setting that `theirs` lacks is younger than it, and had its default's
-    effect then; one that only `theirs` has counts as None on our side.
+    Those of `RESULT_NEUTRAL` are left out; a key that only one side has counts as None on the other.
     """
-    left, right = _flat(ours), _flat(settings.to_dict(TrainConfig())) | _flat(theirs)
+    left, right = _flat(ours), _flat(theirs)
     return {
         key: (left.get(key), right.get(key))
         for key in sorted(left.keys() | right.keys())

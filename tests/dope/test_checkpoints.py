@@ -373,6 +373,18 @@ def test_settings_that_do_not_change_the_result_may_differ(run: Path) -> None:
     resume(run, new_state(other, ALONE), other, "shards")
 
 
+def test_a_setting_younger_than_the_checkpoint_had_its_defaults_effect(run: Path) -> None:
+    path = find_checkpoint(run)
+    values = torch.load(path, weights_only=True)
+    del values["config"]["data"]["order"]
+    torch.save(values, path)
+    Path(f"{path}.sha256").unlink()
+    resume(run, new_state(CONFIG, ALONE), CONFIG, "shards")
+    other = replace(CONFIG, data=replace(CONFIG.data, order="sequential"))
+    with pytest.raises(UsageError, match=r"data\.order is sequential, was shuffled"):
+        resume(run, new_state(other, ALONE), other, "shards")
+
+
 def test_other_shards_are_refused(run: Path) -> None:
     with pytest.raises(UsageError, match="other shards"):
         resume(run, new_state(CONFIG, ALONE), CONFIG, "others")

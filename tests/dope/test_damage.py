@@ -29,7 +29,7 @@ from dope.trainer import train
 TINY = [
     "network.width=0.125", "network.pyramid=16", "network.projector=[16, 8]", "data.image_size=32", "data.points=8",
     "data.batch_size=4", "data.pairs_per_object=1", "data.workers=0", "schedule.epochs=4", "validation.every=0",
-    "checkpoint.every=0", "log_every=1", "device=cpu",
+    "checkpoint.every=0", "log.every=1", "device=cpu",
 ]  # fmt: skip
 
 
