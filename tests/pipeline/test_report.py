@@ -100,6 +100,8 @@ def test_a_browser_shows_every_sequence_and_complains_of_nothing(work: Path, tmp
     assert page.title == "Cups &amp; bowls: 1 ok, 1 waiting, 2 failed"
     assert page.rows == ["bad_1", "bad_2", "ball", "half"] and page.count == "4 sequences"
     assert 'data-rows="4"' in page.dom and re.search(r'data-milliseconds="\d+"', page.dom)
+    page = shown(tmp_path / "report.html", "#s2")  # asked for, a sheet is filled at once; others when they come near
+    assert page.complaints == []
     ball = page.dom.partition('id="s2"')[2].partition("</article>")[0]
     assert ball.count('class="edge"') == ball.count('alt="Depth of frame') == 6
     assert ball.count('class="frustum"') == 6 and ball.count("<line ") == 18 and ball.count("<image ") == 8
