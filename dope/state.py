@@ -9,13 +9,12 @@ import torch
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
-from dope.common.errors import UsageError
 from dope.common.seeds import derive_seed
 from dope.config import TrainConfig
 from dope.distributed import Ranks
-from dope.networks import DopeNetwork, MomentumEncoder
+from dope.networks import DopeNetwork, MomentumEncoder, synchronise_batchnorm
 from dope.order import Place
-from dope.step import OnlineEncoder
+from dope.queries import OnlineEncoder
 
 
 @dataclass
@@ -42,25 +41,39 @@ def new_state(config: TrainConfig, ranks: Ranks) -> TrainState:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derive_seed(config.seed, "weights"))
         network = DopeNetwork(config.network)
-    momentum = MomentumEncoder(network, config.momentum).to(ranks.device)
     if config.distributed.sync_batchnorm and ranks.world > 1:
-        if ranks.device.type != "cuda":
-            raise UsageError("needs CUDA", where="distributed.sync_batchnorm", remedy="Set it to false")
-        network = nn.SyncBatchNorm.convert_sync_batchnorm(network)
-    network = network.to(ranks.device).train()
+        network = synchronise_batchnorm(network, ranks.device)
+    layout = torch.channels_last if config.channels_last else torch.contiguous_format
+    network = network.to(device=ranks.device, memory_format=layout).train()  # type: ignore[call-overload]
+    momentum = MomentumEncoder(network, config.momentum, compiled=config.compile)
     options = config.optimiser
     optimiser = torch.optim.AdamW(
         network.parameters(), options.lr, betas=options.betas, weight_decay=options.weight_decay, fused=True
     )
+    optimiser.register_load_state_dict_post_hook(_match_layout)
     return TrainState(network, momentum, optimiser)
 
 
-def wrap(network: DopeNetwork, ranks: Ranks) -> nn.Module:
+def _match_layout(optimiser: torch.optim.Optimizer) -> None:
+    """Lay out loaded moments as their parameters are: the fused step walks over the memory of both at once."""
+    for parameter, values in optimiser.state.items():
+        for name, value in values.items():
+            if value.shape == parameter.shape and value.stride() != parameter.stride():
+                values[name] = torch.empty_like(parameter).copy_(value)
+
+
+def wrap(network: DopeNetwork, ranks: Ranks, *, compiled: bool = False) -> nn.Module:
     """The online encoder, its gradients averaged over ranks where there are several."""
-    online = OnlineEncoder(network)
+    online = OnlineEncoder(network, compiled=compiled)
     if ranks.world == 1:
         return online
-    return DistributedDataParallel(online, device_ids=[ranks.device] if ranks.device.type == "cuda" else None)
+    # running statistics take no part in training and are the first rank's where they count: nothing to broadcast
+    return DistributedDataParallel(
+        online,
+        device_ids=[ranks.device] if ranks.device.type == "cuda" else None,
+        broadcast_buffers=False,
+        gradient_as_bucket_view=True,
+    )
 
 
 def total_steps(config: TrainConfig, steps_per_epoch: int) -> int:

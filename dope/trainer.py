@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 import math
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,11 @@ from dope.common.errors import DopeError, UsageError
 from dope.config import TrainConfig, check
 from dope.distributed import Ranks, ranks_of
 from dope.heap import keep_heap
+from dope.memory import MemoryWatch
+from dope.networks import DopeNetwork
 from dope.networks.untrained import settle_batchnorm
 from dope.order import SampleOrder
+from dope.queries import micro_batches
 from dope.run_logging import Meter, RunLog, SilentLog
 from dope.state import TrainState, learning_rate, new_state, total_steps, wrap
 from dope.step import compute_losses, sample_batch
@@ -58,26 +61,29 @@ def train(
             last_step = min(last_step, state.step + stop_after)
         rows = run.order.batches(state.place, config.schedule.epochs, rank=ranks.rank, world=ranks.world)
         loader = PairLoader(run.dataset, rows, workers=config.data.workers, pin_memory=ranks.device.type == "cuda")
-        online, meter = wrap(state.network, ranks), Meter(state.step)
+        online, meter = wrap(state.network, ranks, compiled=config.compile), Meter(state.step)
         with run.begin() as log:
             stopping = state.step >= last_step
             for batch in loader if not stopping else ():
                 lr = learning_rate(config, state.step, run.order.steps_per_epoch)
                 for group in state.optimiser.param_groups:
                     group["lr"] = lr
-                sampled = sample_batch(batch.to(ranks.device), config, state.step, ranks.rank)
-                losses = compute_losses(
-                    online, state.momentum, sampled, config, ranks, step=state.step, stop=stop.requested
-                )
-                if not math.isfinite(losses.report["loss"]):
-                    raise run.not_finite(losses.report, batch, log)
-                state.optimiser.zero_grad(set_to_none=True)
-                losses.backward.backward()
+                sampled = sample_batch(batch.to(ranks.device), config, state.step, ranks.share_of_batch)
+                with MemoryWatch(online, ranks.device) if state.step == meter.first_step else nullcontext() as memory:
+                    losses = compute_losses(
+                        online, state.momentum, sampled, config, ranks, step=state.step, stop=stop.requested
+                    )
+                    if not math.isfinite(losses.report["loss"]):
+                        raise run.not_finite(losses.report, batch, log)
+                    state.optimiser.zero_grad(set_to_none=True)
+                    losses.backward()
                 state.optimiser.step()
                 state.momentum.update(state.network)
 
                 state.step, state.place = state.step + 1, run.order.after(state.place)
                 stopping = losses.stop or state.step >= last_step
+                if memory is not None:
+                    log.event("memory", state.step, state.place.epoch, memory.report())
                 meter.add(config.data.batch_size, losses.report["loss"])
                 log.progress(state.step, meter.loss, meter.pairs_per_second)
                 if stopping or state.step % config.log_every == 0:
@@ -140,7 +146,9 @@ class Run:
             return
         network = self.state.network
         if self.state.step == 0:  # random weights without the statistics of real images would be no baseline at all
-            network = copy.deepcopy(network)
+            network = DopeNetwork(network.config)  # a plain copy: the ranks' numbers of batches may differ
+            network.load_state_dict(self.state.network.state_dict())
+            network.to(self.ranks.device)
             images = (no_augmentation(batch.to(self.ranks.device)).images1 for batch in self.held_out)
             settle_batchnorm(network, images)
         self.ranks.copy_from_first(network)  # the ranks' BatchNorm statistics differ by their last batch
@@ -200,6 +208,8 @@ def open_run(shards: Path, out: Path, config: TrainConfig, ranks: Ranks, resume:
     order = SampleOrder(
         dataset.index.objects, data.batch_size, pairs_per_object=data.pairs_per_object, seed=config.seed
     )
+    if data.batch_size % ranks.world == 0:  # else `SampleOrder.batches` says so
+        micro_batches(data.batch_size // ranks.world, data.micro_batch)
     held_out = read_held_out(shards, config, ranks)
     state = new_state(config, ranks)
     found = checkpoint_to_resume(out, resume)
