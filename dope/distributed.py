@@ -108,6 +108,11 @@ def ranks_of(device: str) -> Iterator[Ranks]:
         dist.destroy_process_group()
 
 
+def restarted() -> bool:
+    """Whether torchrun has started this process again, in the same call, because a rank died."""
+    return int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")) > 0
+
+
 def pick_device(name: str, local_rank: int = 0, *, flag: str = "--set device=") -> torch.device:
     """The torch device that a setting means. Raises `UsageError`, naming `flag`, where there is no such device."""
     where = flag.rstrip(" =")

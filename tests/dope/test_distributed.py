@@ -1,6 +1,8 @@
 import os
+import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +13,7 @@ import torch
 from tiny_shards import write_shards
 
 from dope import commands
-from dope.checkpoints import list_checkpoints, load_network
+from dope.checkpoints import list_checkpoints, load_network, read_checkpoint
 from dope.common.errors import UsageError
 from dope.config import load_config
 from dope.distributed import Ranks, pick_device, ranks_of
@@ -26,14 +28,15 @@ ALONE = Ranks(0, 1, torch.device("cpu"))
 pytestmark = pytest.mark.timeout(240)
 
 
+def environment() -> dict[str, str]:
+    root = Path(__file__).parents[2]
+    return {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(root), "GLOO_SOCKET_IFNAME": "lo"}
+
+
 def torchrun(world: int, *arguments: str) -> None:
     """So many ranks on this machine; a hanging collective ends with the time limit."""
-    root = Path(__file__).parents[2]
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(world)]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(root), "GLOO_SOCKET_IFNAME": "lo"}
-    done = subprocess.run(
-        [*command, *arguments], env=environment, timeout=200, capture_output=True, text=True, cwd=root
-    )
+    done = subprocess.run([*command, *arguments], env=environment(), timeout=200, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 
@@ -159,6 +162,44 @@ def test_two_ranks_train_and_one_goes_on(shards: Path, tmp_path: Path) -> None:
     assert result["status"] == "finished" and result["steps_of_this_call"] == 3
     assert [line["step"] for line in read_metrics(tmp_path, "step")] == [1, 2, 3, 4, 5, 6]
     assert load_network(tmp_path)[1]["step"] == 6
+
+
+def rank_processes(run: Path) -> dict[int, int]:
+    """Rank -> process id of the ranks that train into `run`."""
+    found = {}
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            if str(run).encode() in (process / "cmdline").read_bytes():
+                entries = (process / "environ").read_bytes().split(b"\0")
+                found |= {int(entry[5:]): int(process.name) for entry in entries if entry.startswith(b"RANK=")}
+        except OSError:  # gone, or not ours
+            continue
+    return found
+
+
+@pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="looks for the ranks in /proc")
+def test_a_killed_rank_leads_to_a_restart_that_finishes_the_job(shards: Path, tmp_path: Path) -> None:
+    settings = [
+        *many_ranks.SETTINGS, "data.batch_size=4", "data.pairs_per_object=1", "data.workers=0", "schedule.epochs=30",
+        "validation.every=0", "checkpoint.every=2", "checkpoint.keep=2", "log_every=1",
+    ]  # fmt: skip
+    command = [sys.executable, "-m", "cli", "train", str(shards), "--out", str(tmp_path), "--preset", "nano"]
+    # --resume never: a restart must go on all the same
+    command += ["--nproc", "2", "--max-restarts", "1", "--resume", "never", *as_flags(settings)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment(), start_new_session=True)
+    try:
+        while process.poll() is None and not list_checkpoints(tmp_path):
+            time.sleep(0.02)
+        os.kill(rank_processes(tmp_path)[1], signal.SIGKILL)
+        _, errors = process.communicate(timeout=120)
+    finally:
+        process.terminate()
+    assert process.returncode == 0, errors
+    starts = read_metrics(tmp_path, "start")
+    assert len(starts) == 2 and starts[1]["step"] > 0 and starts[1]["resumed_from"] is not None
+    assert [line["step"] for line in read_metrics(tmp_path, "step")] == list(range(1, 61))
+    values = read_checkpoint(tmp_path)
+    assert (values["step"], values["epoch"], values["samples_consumed"]) == (60, 30, 0)
 
 
 def test_devices() -> None:
