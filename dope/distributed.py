@@ -14,7 +14,6 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
-from dope.augmentation import Share
 from dope.common.errors import UsageError
 
 
@@ -35,11 +34,6 @@ class Ranks:
     def is_first(self) -> bool:
         """True on the rank that writes files and talks."""
         return self.rank == 0
-
-    @property
-    def share_of_batch(self) -> Share:
-        """The part of a global batch that this rank computes."""
-        return Share(self.rank, self.world)
 
     def gather(self, tensor: Tensor) -> Tensor:
         """Concatenate equal-shaped (b, ...) tensors of all ranks, in the order of ranks; no gradient."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from dataclasses import dataclass, field
 
@@ -67,12 +68,14 @@ def wrap(network: DopeNetwork, ranks: Ranks, *, compiled: bool = False) -> nn.Mo
     online = OnlineEncoder(network, compiled=compiled)
     if ranks.world == 1:
         return online
-    # running statistics take no part in training and are the first rank's where they count: nothing to broadcast
+    known = inspect.signature(DistributedDataParallel).parameters
+    broadcast = "forward_sync_buffers" if "forward_sync_buffers" in known else "broadcast_buffers"  # as it was called
     return DistributedDataParallel(
         online,
         device_ids=[ranks.device] if ranks.device.type == "cuda" else None,
-        broadcast_buffers=False,
         gradient_as_bucket_view=True,
+        # running statistics take no part in training and are the first rank's where they count
+        **{broadcast: False},
     )
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 
 from dope import checkpoints
-from dope.augmentation import no_augmentation
+from dope.augmentation import Share, no_augmentation
 from dope.batch import PairBatch
 from dope.common import files, settings
 from dope.common.errors import DopeError, UsageError
@@ -62,13 +62,14 @@ def train(
         rows = run.order.batches(state.place, config.schedule.epochs, rank=ranks.rank, world=ranks.world)
         loader = PairLoader(run.dataset, rows, workers=config.data.workers, pin_memory=ranks.device.type == "cuda")
         online, meter = wrap(state.network, ranks, compiled=config.compile), Meter(state.step)
+        share = Share(ranks.rank, ranks.world)
         with run.begin() as log:
             stopping = state.step >= last_step
             for batch in loader if not stopping else ():
                 lr = learning_rate(config, state.step, run.order.steps_per_epoch)
                 for group in state.optimiser.param_groups:
                     group["lr"] = lr
-                sampled = sample_batch(batch.to(ranks.device), config, state.step, ranks.share_of_batch)
+                sampled = sample_batch(batch.to(ranks.device), config, state.step, share)
                 with MemoryWatch(online, ranks.device) if state.step == meter.first_step else nullcontext() as memory:
                     losses = compute_losses(
                         online, state.momentum, sampled, config, ranks, step=state.step, stop=stop.requested

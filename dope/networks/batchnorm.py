@@ -21,7 +21,7 @@ class SyncBatchNorm2d(nn.BatchNorm2d):
     """BatchNorm2d whose statistics in training are those of all processes' batches together, on any device.
 
     `torch.nn.SyncBatchNorm` is for CUDA alone. State-dict keys and, up to rounding, results are those of BatchNorm2d
-    on one process with all the images. Statistics are float32 also where the input is of half precision.
+    on one process with all the images. Statistics are float32 at least, also where the input is of half precision.
 
     The gradient of an input is that of the SUM of all processes' losses: the two sums over a channel which it needs
     are added up over the processes in the backward pass. Gradients of weight and bias stay this process's own. So
@@ -49,9 +49,9 @@ class _Synchronised(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor, eps: float) -> tuple[Tensor, ...]:
-        own_variance, own_mean = torch.var_mean(x.float(), CHANNELS_APART, correction=0)
-        own_count = own_mean.new_tensor([x.numel() / x.shape[1]])
-        sent = torch.cat([own_mean, own_variance, own_count])
+        wide = x.to(torch.promote_types(x.dtype, torch.float32))
+        own_variance, own_mean = torch.var_mean(wide, CHANNELS_APART, correction=0)
+        sent = torch.cat([own_mean, own_variance, own_mean.new_tensor([x.numel() / x.shape[1]])])
         received = [torch.empty_like(sent) for _ in range(dist.get_world_size())]
         dist.all_gather(received, sent)
         means, variances, counts = torch.stack(received).split([len(own_mean), len(own_mean), 1], 1)
@@ -61,21 +61,22 @@ class _Synchronised(torch.autograd.Function):
         variance = ((variances + (means - mean).square()) * counts).sum(0) / count
         ctx.save_for_backward(x, weight, mean, (variance + eps).rsqrt(), count)
         ctx.mark_non_differentiable(mean, variance, count)
-        normalised = F.batch_norm(x.float(), mean, variance, weight.float(), bias.float(), eps=eps)
+        normalised = F.batch_norm(wide, mean, variance, weight.to(wide.dtype), bias.to(wide.dtype), eps=eps)
         return normalised.to(x.dtype), mean, variance, count
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor, *_: Any) -> tuple[Tensor | None, ...]:
         x, weight, mean, inverse, count = ctx.saved_tensors
-        gradient, wide = gradient.float(), (None, slice(None), None, None)
-        standard = (x.float() - mean[wide]).mul_(inverse[wide])
+        each = (None, slice(None), None, None)  # a value for each channel, against (B, C, H, W)
+        gradient = gradient.to(mean.dtype)
+        standard = (x.to(mean.dtype) - mean[each]).mul_(inverse[each])
         own = torch.stack([gradient.sum(CHANNELS_APART), (gradient * standard).sum(CHANNELS_APART)])
         everywhere = own.clone()
         dist.all_reduce(everywhere)
         by_mean, by_variance = everywhere / count
-        x_gradient = gradient - standard.mul_(by_variance[wide]).add_(by_mean[wide])
-        x_gradient.mul_((inverse * weight)[wide])
+        x_gradient = gradient - standard.mul_(by_variance[each]).add_(by_mean[each])
+        x_gradient.mul_((inverse * weight)[each])
         return x_gradient.to(x.dtype), own[1].to(weight.dtype), own[0].to(weight.dtype), None
 
 

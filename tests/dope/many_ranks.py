@@ -65,9 +65,14 @@ def outcome(batch: SampledBatch, config: TrainConfig, ranks: Ranks, *, training:
     """Loss, gradients and BatchNorm's statistics after a step, and the keys of a momentum encoder in training mode.
 
     Args:
-        training: whether BatchNorm takes the batch's statistics in the step; it is frozen otherwise.
+        training: whether BatchNorm takes the batch's statistics in the step; it is frozen otherwise. The encoders
+            then compute in float64: in float32, merely another order of the images changes gradients by over 1e-5.
     """
     state = new_state(config, ranks)
+    if training:
+        state.network.double(), state.momentum.double()
+        views = replace(batch.views, images1=batch.views.images1.double(), images2=batch.views.images2.double())
+        batch = replace(batch, views=views)
     online = wrap(state.network, ranks).train(training)
     state.momentum.train(training)
     losses = compute_losses(online, state.momentum, batch, config, ranks, step=5, stop=ranks.rank == 1)
