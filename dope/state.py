@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import nn
@@ -70,12 +71,12 @@ def wrap(network: DopeNetwork, ranks: Ranks, *, compiled: bool = False) -> nn.Mo
         return online
     known = inspect.signature(DistributedDataParallel).parameters
     broadcast = "forward_sync_buffers" if "forward_sync_buffers" in known else "broadcast_buffers"  # as it was called
+    options: dict[str, Any] = {broadcast: False}
     return DistributedDataParallel(
         online,
         device_ids=[ranks.device] if ranks.device.type == "cuda" else None,
         gradient_as_bucket_view=True,
-        # running statistics take no part in training and are the first rank's where they count
-        **{broadcast: False},
+        **options,  # running statistics take no part in training and are the first rank's where they count
     )
 
 

@@ -16,7 +16,7 @@ from dope.batch import PairBatch
 from dope.common import files, settings
 from dope.common.errors import DopeError, UsageError
 from dope.config import TrainConfig, check
-from dope.distributed import Ranks, ranks_of, restarted
+from dope.distributed import Ranks, ranks_of, restarts
 from dope.heap import keep_heap
 from dope.memory import MemoryWatch
 from dope.networks import DopeNetwork
@@ -232,7 +232,7 @@ def read_held_out(shards: Path, config: TrainConfig, ranks: Ranks) -> list[PairB
 def checkpoint_to_resume(out: Path, resume: str | Path) -> Path | None:
     """The checkpoint to go on from, or None to begin. Raises as `train` does."""
     newest = checkpoints.latest_checkpoint(out)
-    if resume == "auto" or (newest is not None and restarted()):
+    if resume == "auto" or (newest is not None and restarts()):
         return newest
     if resume == "never":
         if newest is not None:
