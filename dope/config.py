@@ -54,7 +54,7 @@ class LossConfig:
     """Negatives of a point: other points of its object in view 2, all points of other objects, or both."""
     mask_weight: float = 1.0
     """Weight of the mask loss against the contrastive loss; 0 leaves it out."""
-    chunk: int = 2048
+    chunk: int = 512
     """Queries whose logits are in memory at a time."""
 
 
@@ -149,8 +149,8 @@ class TrainConfig:
     """What is saved, and when."""
     precision: Literal["auto", "fp32", "bf16"] = "fp32"
     """bf16 runs the encoders in autocast, normalisation and losses in fp32 (slow on most CPUs); auto: bf16 on CUDA."""
-    channels_last: bool = False
-    """Keep images and weights with the channels innermost in memory, which tensor cores want."""
+    channels_last: bool = True
+    """Keep weights and feature maps with the channels innermost in memory: faster on CPUs and tensor cores."""
     compile: bool = False
     """Compile the encoders' forward and backward pass by torch.compile: minutes at the start, fewer in each step."""
     device: str = "auto"

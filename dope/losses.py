@@ -26,7 +26,7 @@ def contrastive_loss(
     *,
     temperature: float = 0.1,
     negatives: Negatives = "both",
-    chunk: int = 1024,
+    chunk: int = 512,
     reduction: Literal["mean", "sum"] = "mean",
 ) -> Tensor:
     """Cross entropy of each query's positive key against its negative keys (InfoNCE, positive in the denominator).
