@@ -40,6 +40,9 @@ def train(
         str, typer.Option(help="auto: go on where RUN stopped; never: insist on a new RUN; or a checkpoint.")
     ] = "auto",
     nproc: Annotated[int, typer.Option(min=1, help="Processes on this machine (what torchrun would start).")] = 1,
+    max_restarts: Annotated[
+        int, typer.Option(min=0, help="With --nproc: times that all processes start again after one died.")
+    ] = 0,
     stop_after: Annotated[
         int | None, typer.Option(min=1, help="Stop with a checkpoint after so many steps.", show_default=False)
     ] = None,
@@ -61,6 +64,10 @@ def train(
     Slurm, in a script with #SBATCH --requeue and --signal=USR1@120 (the signal comes 120 s before the limit):
     srun dope train shards --out run || { [ $? = 75 ] && scontrol requeue $SLURM_JOB_ID; }
 
+    When one of several processes dies, torchrun notices within a second and ends the others (SIGTERM, after 30 s
+    SIGKILL); with --max-restarts it then starts all of them again, and they go on from RUN's newest checkpoint:
+    --set checkpoint.every says how much is done twice.
+
     Examples:
 
       dope train shards --out run --preset nano
@@ -79,7 +86,7 @@ def train(
         from dope.shard_index import read_index
 
         read_index(shards, "train")  # what is wrong with them is said once, here, not by every process
-        raise typer.Exit(_launch(nproc))
+        raise typer.Exit(_launch(nproc, max_restarts))
 
     from dope.stop_signals import EXIT_STOPPED
     from dope.trainer import train as run_training
@@ -207,8 +214,11 @@ def figure(
         typer.echo(path)
 
 
-def _launch(nproc: int) -> int:
+def _launch(nproc: int, max_restarts: int) -> int:
     """Start this very command under torchrun, without --nproc's effect in the children (they see RANK).
+
+    A process that dies ends the others, too: torchrun looks every 0.1 s, sends SIGTERM, and SIGKILL to those that are
+    left after 30 s, e.g. waiting on a GPU for the dead one. After that it starts all of them again, or gives up.
 
     SIGTERM, SIGUSR1 and Ctrl-C are handed on as SIGTERM, and torchrun lets the processes write a checkpoint (it waits
     30 s). It ends with 1 however they ended; a run that was asked to stop ends with 75 here, as that of one process
@@ -217,6 +227,7 @@ def _launch(nproc: int) -> int:
     from dope.stop_signals import EXIT_STOPPED, STOP_SIGNALS
 
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(nproc)]
+    command += ["--max-restarts", str(max_restarts)]
     asked = False
     # torchrun inherits this: Slurm sends SIGUSR1 to every process, and torchrun would die of it
     signal.signal(signal.SIGUSR1, signal.SIG_IGN)

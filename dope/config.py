@@ -19,8 +19,13 @@ from dope.networks import NetworkConfig
 from dope.order import Order
 from dope.preset_files import merged, preset_values
 
-RESULT_NEUTRAL = ("data.workers", "data.max_bad_samples", "device", "validation", "checkpoint", "log")
-"""Settings that do not change what is learnt: a run may be resumed with other values of these."""
+RESULT_NEUTRAL = (
+    "data.workers", "data.max_bad_samples", "device", "channels_last", "compile", "validation", "checkpoint", "log",
+)  # fmt: skip
+"""Settings that do not change what is learnt: a run may be resumed with other values of these.
+
+`device`, `channels_last` and `compile` choose among programs that compute the same up to rounding.
+"""
 
 
 @dataclass(frozen=True)
@@ -31,6 +36,8 @@ class DataConfig:
     """Side of the images in pixels, a multiple of 32; the loader resizes the views and scales their points."""
     batch_size: int = 256
     """Pairs in a step over all ranks together; incomplete batches are dropped."""
+    micro_batch: int = 0
+    """Pairs whose activations a rank has in memory at a time, all keys being contrasted anyway; 0 = its whole share."""
     pairs_per_object: int = 1
     """Pairs of each object in an epoch (1 in the paper)."""
     points: int = 32
@@ -59,7 +66,7 @@ class LossConfig:
     """Negatives of a point: other points of its object in view 2, all points of other objects, or both."""
     mask_weight: float = 1.0
     """Weight of the mask loss against the contrastive loss; 0 leaves it out."""
-    chunk: int = 2048
+    chunk: int = 512
     """Queries whose logits are in memory at a time."""
 
 
@@ -136,9 +143,10 @@ class DistributedConfig:
     """What changes with more than one rank."""
 
     sync_batchnorm: bool = False
-    """BatchNorm statistics of the online encoder over all ranks (CUDA only)."""
+    """BatchNorm statistics of both encoders over all ranks: N ranks then train as one process would."""
     shuffle_batchnorm: bool = True
-    """Shuffle the momentum encoder's images over the ranks, so that BatchNorm does not give pairs away (MoCo)."""
+    """Shuffle the momentum encoder's images over the ranks, so that BatchNorm does not give pairs away (MoCo); has no
+    purpose, and is not done, with `sync_batchnorm`."""
     local_negatives: bool = False
     """Contrast with the own rank's keys only, as the released code: the loss then depends on the number of ranks."""
 
@@ -169,8 +177,12 @@ class TrainConfig:
     """PCK on held-out pairs."""
     checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)
     """What is saved, and when."""
-    precision: Literal["fp32", "bf16"] = "fp32"
-    """bf16 runs the encoders in autocast; losses stay in fp32. Slow on most CPUs."""
+    precision: Literal["auto", "fp32", "bf16"] = "fp32"
+    """bf16 runs the encoders in autocast, normalisation and losses in fp32 (slow on most CPUs); auto: bf16 on CUDA."""
+    channels_last: bool = True
+    """Keep weights and feature maps with the channels innermost in memory: faster on CPUs and tensor cores."""
+    compile: bool = False
+    """Compile the encoders' forward and backward pass by torch.compile: minutes at the start, fewer in each step."""
     device: str = "auto"
     """auto (CUDA where there is one), cpu, cuda or cuda:N."""
     log: LogConfig = field(default_factory=LogConfig)
@@ -207,6 +219,7 @@ def check(config: TrainConfig) -> None:
     rules = (
         ("data.image_size", data.image_size >= 32 and data.image_size % 32 == 0, "must be a positive multiple of 32"),
         ("data.batch_size", data.batch_size >= 2, "must be at least 2: the other pairs of a batch are the negatives"),
+        ("data.micro_batch", data.micro_batch >= 0, "must not be negative"),
         ("data.pairs_per_object", data.pairs_per_object >= 1, "must be at least 1"),
         ("data.points", data.points >= 1, "must be at least 1"),
         ("data.max_points", data.max_points >= data.points, "must not be less than data.points"),

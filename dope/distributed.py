@@ -13,8 +13,11 @@ from typing import Any
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
+from torch.distributed.rendezvous import rendezvous
 
 from dope.common.errors import UsageError
+
+TIMEOUT = timedelta(minutes=20)  # of a collective: validation and checkpoints make ranks wait for each other
 
 
 @dataclass(frozen=True)
@@ -86,20 +89,27 @@ def ranks_of(device: str) -> Iterator[Ranks]:
         UsageError: an unknown or absent device.
     """
     world = int(os.environ.get("WORLD_SIZE", "1"))
-    rank, local = int(os.environ.get("RANK", "0")), int(os.environ.get("LOCAL_RANK", "0"))
-    chosen = pick_device(device, local if world > 1 else 0)
+    chosen = pick_device(device, int(os.environ.get("LOCAL_RANK", "0")) if world > 1 else 0)
     if chosen.type == "cuda":
         torch.cuda.set_device(chosen)
     if world == 1:
         yield Ranks(0, 1, chosen)
         return
     backend = "nccl" if chosen.type == "cuda" else "gloo"
-    dist.init_process_group(backend, timeout=timedelta(minutes=20))
+    # after a restart, torchrun's store still holds the addresses of the ranks before, which would be tried in vain
+    store, rank, world = next(rendezvous("env://", timeout=TIMEOUT))
+    store = dist.PrefixStore(f"start {restarts()}", store)
+    dist.init_process_group(backend, store=store, rank=rank, world_size=world, timeout=TIMEOUT)
     try:
         yield Ranks(rank, world, chosen)
     finally:
         gc.collect()  # what DistributedDataParallel holds of the group must go before the group's threads do
         dist.destroy_process_group()
+
+
+def restarts() -> int:
+    """How often torchrun has started the ranks again, in this call, because one died."""
+    return int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"))
 
 
 def pick_device(name: str, local_rank: int = 0, *, flag: str = "--set device=") -> torch.device:

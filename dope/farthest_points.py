@@ -9,10 +9,8 @@ TAKEN = -1.0  # a squared distance below any real one: such a point is never the
 
 
 @torch.no_grad()
-def farthest_points(
-    points: Tensor, valid: Tensor, n: int, generator: torch.Generator | None = None
-) -> tuple[Tensor, Tensor]:
-    """Choose `n` points of each set, each the farthest from those chosen before, from a random start.
+def farthest_points(points: Tensor, valid: Tensor, n: int, start: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Choose `n` points of each set, each the farthest from those chosen before.
 
     No point is chosen twice, and no invalid point ever. Ties go to the lowest index.
 
@@ -20,7 +18,8 @@ def farthest_points(
         points: (B, N, 2) float.
         valid: (B, N) bool, False for padding.
         n: points to choose of each set.
-        generator: of the random starts; PyTorch's default one where None.
+        start: (B,) in [0, 1), where among its valid points a set begins (uniform draws make the start random); the
+            first valid point where None.
 
     Returns:
         (B, n) long indices and (B, n) bool: False beyond the number of valid points, where the index repeats the first
@@ -35,10 +34,8 @@ def farthest_points(
     x, y = points.float().masked_fill(~valid[..., None], 0.0).unbind(-1)
     x, y = x.contiguous(), y.contiguous()
     distance = torch.where(valid, torch.inf, TAKEN)
-    device = points.device if generator is None else generator.device
-    draw = torch.rand(len(points), generator=generator, device=device).to(points.device)
-    start = (draw * count).long().clamp(max=points.shape[1] - 1)  # the start-th valid point
-    chosen = ((valid.cumsum(1) == start[:, None] + 1) & valid).to(torch.uint8).argmax(1, keepdim=True)
+    before = torch.zeros_like(count) if start is None else (start * count).long().clamp(max=points.shape[1] - 1)
+    chosen = ((valid.cumsum(1) == before[:, None] + 1) & valid).to(torch.uint8).argmax(1, keepdim=True)
     for i in range(n):
         if i > 0:
             chosen = distance.argmax(1, keepdim=True)

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 Negatives = Literal["both", "other_objects", "second_view"]
+SMALL_LOGIT = 40.0  # sums of the exponentials of such logits neither overflow nor vanish in float32
 Excluded = Callable[[slice], Tensor]  # queries of a chunk -> (chunk, K) bool: keys that are no negatives
 
 
@@ -25,7 +26,7 @@ def contrastive_loss(
     *,
     temperature: float = 0.1,
     negatives: Negatives = "both",
-    chunk: int = 1024,
+    chunk: int = 512,
     reduction: Literal["mean", "sum"] = "mean",
 ) -> Tensor:
     """Cross entropy of each query's positive key against its negative keys (InfoNCE, positive in the denominator).
@@ -57,10 +58,21 @@ def contrastive_loss(
         other_pair = query_pair[rows, None] != key_pair
         return other_pair if negatives == "second_view" else other_pair & same_object
 
-    needed = negatives != "both" or _repeats(query_object, key_object, query_pair, key_pair)
+    repeats = _repeats(query_object, key_object, query_pair, key_pair)
+    small = _largest_logit(queries, keys, temperature) < SMALL_LOGIT
+    # both are asked at once, which on a GPU means to wait once
+    repeats_objects, small_logits = torch.stack([repeats, small]).tolist()
+    needed = negatives != "both" or repeats_objects
     with torch.autocast(queries.device.type, enabled=False):
         total = _ChunkedCrossEntropy.apply(
-            queries, keys, positive, excluded if needed else None, temperature, chunk, torch.is_grad_enabled()
+            queries,
+            keys,
+            positive,
+            excluded if needed else None,
+            temperature,
+            chunk,
+            small_logits,
+            torch.is_grad_enabled(),
         )
     return total / len(queries) if reduction == "mean" else total
 
@@ -74,13 +86,19 @@ def mask_loss(mask_logits: Tensor, masks: Tensor) -> Tensor:
     return F.binary_cross_entropy_with_logits(mask_logits.float(), target)
 
 
-def _repeats(query_object: Tensor, key_object: Tensor, query_pair: Tensor, key_pair: Tensor) -> bool:
-    """Whether any object appears in more than one pair (then a few similarities must be left out)."""
+@torch.no_grad()
+def _largest_logit(queries: Tensor, keys: Tensor, temperature: float) -> Tensor:
+    """A bound, scalar, on the absolute values of all logits."""
+    return queries.square().sum(1).amax().mul(keys.square().sum(1).amax()).sqrt() / temperature
+
+
+def _repeats(query_object: Tensor, key_object: Tensor, query_pair: Tensor, key_pair: Tensor) -> Tensor:
+    """Scalar bool: whether any object appears in more than one pair (then a few similarities must be left out)."""
     pairs = torch.cat([query_pair, key_pair])
     objects, index = torch.unique(torch.cat([query_object, key_object]), return_inverse=True)
     first = pairs.new_zeros(len(objects)).scatter_reduce(0, index, pairs, "amin", include_self=False)
     last = pairs.new_zeros(len(objects)).scatter_reduce(0, index, pairs, "amax", include_self=False)
-    return bool((first != last).any())
+    return (first != last).any()
 
 
 class _ChunkedCrossEntropy(torch.autograd.Function):
@@ -99,6 +117,7 @@ class _ChunkedCrossEntropy(torch.autograd.Function):
         excluded: Excluded | None,
         temperature: float,
         chunk: int,
+        small_logits: bool,
         with_gradient: bool,
     ) -> Tensor:
         query_gradient = torch.empty_like(queries) if with_gradient and ctx.needs_input_grad[0] else None
@@ -113,9 +132,8 @@ class _ChunkedCrossEntropy(torch.autograd.Function):
             positive_logit = weights.gather(1, own)
             if excluded is not None:
                 weights.masked_fill_(excluded(rows), -torch.inf).scatter_(1, own, positive_logit)
-            top = weights.amax(1, keepdim=True)
-            weights.sub_(top).exp_()
-            total = weights.sum(1, keepdim=True)
+            top = positive_logit.new_zeros(()) if small_logits else weights.amax(1, keepdim=True)
+            total = (weights if small_logits else weights.sub_(top)).exp_().sum(1, keepdim=True)
             losses.append((total.log() + top - positive_logit).sum())
             # (softmax - one-hot) times the other side; dividing the small products spares a pass over the weights
             if query_gradient is not None:
@@ -132,4 +150,4 @@ class _ChunkedCrossEntropy(torch.autograd.Function):
     def backward(ctx: Any, *outputs: Tensor) -> tuple[Tensor | None, ...]:
         (upstream,) = outputs
         gradients = [None if gradient is None else gradient * upstream for gradient in ctx.saved_tensors]
-        return *gradients, None, None, None, None, None
+        return *gradients, *[None] * 6

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,11 +13,13 @@ from dope.batch import DamagedSample, PairBatch
 from dope.common import files, settings
 from dope.common.errors import BadInput, DopeError
 from dope.config import TrainConfig, write_config
-from dope.distributed import Ranks
+from dope.distributed import Ranks, restarts
 from dope.figures.held_out import held_out_sheet
 from dope.meter import Meter
+from dope.networks import DopeNetwork
 from dope.networks.untrained import settle_batchnorm
 from dope.order import SampleOrder
+from dope.queries import micro_batches, resolved_precision
 from dope.run_logging import RunLog, SilentLog, describe_start
 from dope.state import TrainState, new_state, total_steps
 from dope.storage import Shards
@@ -92,7 +93,7 @@ class Run:
             "steps_per_epoch": self.order.steps_per_epoch,
             "total_steps": self.total_steps,
             "parameters": sum(parameter.numel() for parameter in self.state.network.parameters()),
-            "precision": self.config.precision,
+            "precision": resolved_precision(self.config.precision, self.ranks.device),
             "world": self.ranks.world,
             "device": str(self.ranks.device),
             "config_hash": settings.config_hash(self.config),
@@ -124,7 +125,9 @@ class Run:
             return False
         network, step = self.state.network, self.state.step
         if step == 0:  # random weights without the statistics of real images would be no baseline at all
-            network = copy.deepcopy(network)
+            network = DopeNetwork(network.config)  # a plain copy: the ranks' numbers of batches may differ
+            network.load_state_dict(self.state.network.state_dict())
+            network.to(self.ranks.device)
             images = (no_augmentation(batch.to(self.ranks.device)).images1 for batch in self.held_out)
             settle_batchnorm(network, images)
         self.ranks.copy_from_first(network)  # the ranks' BatchNorm statistics differ by their last batch
@@ -196,8 +199,12 @@ def open_run(shards: Shards, out: Path, config: TrainConfig, ranks: Ranks, resum
         order=data.order,
         block=data.block,
     )
+    if data.batch_size % ranks.world == 0:  # else `SampleOrder.batches` says so
+        micro_batches(data.batch_size // ranks.world, data.micro_batch)
     held_out, held_out_damaged = read_held_out(shards, config, ranks)
     state = new_state(config, ranks)
+    if restarts() and checkpoints.latest_checkpoint(out) is not None:
+        resume = "auto"  # whatever it began from: torchrun has started the ranks again in the midst of this call
     found, damaged = checkpoints.go_on_from(resume, out, state, config, dataset.index.fingerprint)
     if len(set(ranks.collect(state.step))) > 1:
         what = "the ranks do not see the same checkpoints"

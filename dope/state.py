@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
-from dope.common.errors import UsageError
 from dope.common.seeds import derive_seed
 from dope.config import TrainConfig
 from dope.distributed import Ranks
-from dope.networks import DopeNetwork, MomentumEncoder
+from dope.networks import DopeNetwork, MomentumEncoder, synchronise_batchnorm
 from dope.order import Place
-from dope.step import OnlineEncoder
+from dope.queries import OnlineEncoder
 
 
 @dataclass
@@ -44,25 +45,41 @@ def new_state(config: TrainConfig, ranks: Ranks) -> TrainState:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derive_seed(config.seed, "weights"))
         network = DopeNetwork(config.network)
-    momentum = MomentumEncoder(network, config.momentum).to(ranks.device)
     if config.distributed.sync_batchnorm and ranks.world > 1:
-        if ranks.device.type != "cuda":
-            raise UsageError("needs CUDA", where="distributed.sync_batchnorm", remedy="Set it to false")
-        network = nn.SyncBatchNorm.convert_sync_batchnorm(network)
-    network = network.to(ranks.device).train()
+        network = synchronise_batchnorm(network, ranks.device)
+    layout = torch.channels_last if config.channels_last else torch.contiguous_format
+    network = network.to(device=ranks.device, memory_format=layout).train()  # type: ignore[call-overload]
+    momentum = MomentumEncoder(network, config.momentum, compiled=config.compile)
     options = config.optimiser
     optimiser = torch.optim.AdamW(
         network.parameters(), options.lr, betas=options.betas, weight_decay=options.weight_decay, fused=True
     )
+    optimiser.register_load_state_dict_post_hook(_match_layout)
     return TrainState(network, momentum, optimiser)
 
 
-def wrap(network: DopeNetwork, ranks: Ranks) -> nn.Module:
+def _match_layout(optimiser: torch.optim.Optimizer) -> None:
+    """Lay out loaded moments as their parameters are: the fused step walks over the memory of both at once."""
+    for parameter, values in optimiser.state.items():
+        for name, value in values.items():
+            if value.shape == parameter.shape and value.stride() != parameter.stride():
+                values[name] = torch.empty_like(parameter).copy_(value)
+
+
+def wrap(network: DopeNetwork, ranks: Ranks, *, compiled: bool = False) -> nn.Module:
     """The online encoder, its gradients averaged over ranks where there are several."""
-    online = OnlineEncoder(network)
+    online = OnlineEncoder(network, compiled=compiled)
     if ranks.world == 1:
         return online
-    return DistributedDataParallel(online, device_ids=[ranks.device] if ranks.device.type == "cuda" else None)
+    known = inspect.signature(DistributedDataParallel).parameters
+    broadcast = "forward_sync_buffers" if "forward_sync_buffers" in known else "broadcast_buffers"  # as it was called
+    options: dict[str, Any] = {broadcast: False}
+    return DistributedDataParallel(
+        online,
+        device_ids=[ranks.device] if ranks.device.type == "cuda" else None,
+        gradient_as_bucket_view=True,
+        **options,  # running statistics take no part in training and are the first rank's where they count
+    )
 
 
 def total_steps(config: TrainConfig, steps_per_epoch: int) -> int:

@@ -7,14 +7,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from dope.augmentation import augment, duplicate_view
+from dope.augmentation import WHOLE, Share, augment, duplicate_view, uniform_rows
 from dope.batch import PairBatch
 from dope.common.seeds import derive_seed
 from dope.config import TrainConfig
 from dope.distributed import Ranks
 from dope.farthest_points import farthest_points
-from dope.losses import contrastive_loss, mask_loss
-from dope.networks import STRIDE, DopeNetwork, MomentumEncoder
+from dope.losses import contrastive_loss
+from dope.networks import STRIDE, MomentumEncoder
+from dope.networks.batchnorm import moving_statistics_once
+from dope.queries import Queries, autocast, micro_batches
 
 
 @dataclass(frozen=True)
@@ -38,43 +40,39 @@ class StepLosses:
     """What a step computes.
 
     Attributes:
-        backward: scalar with gradient, scaled so that averaging gradients over ranks gives the global loss's.
+        queries: the descriptors of view 1, and their way back to the weights.
+        contrastive: scalar with gradient, scaled so that averaging gradients over ranks gives the global loss's.
         report: `loss`, `contrastive`, `mask` and `points`, of all ranks together.
         stop: whether any rank was asked to stop.
     """
 
-    backward: Tensor
+    queries: Queries
+    contrastive: Tensor
     report: dict[str, float]
     stop: bool
 
-
-class OnlineEncoder(nn.Module):
-    """Image to descriptors at cells and mask logits, in one forward, which is what DistributedDataParallel wraps."""
-
-    def __init__(self, network: DopeNetwork) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, images: Tensor, cells: Tensor) -> tuple[Tensor, Tensor]:
-        """(B, 3, H, W), (B, P, 2) to descriptors (B, P, D) and mask logits (B, 1, h, w)."""
-        output = self.network(images)
-        return self.network.sample(output, cells), output.mask_logits
+    def backward(self) -> None:
+        """Add the gradients of the global loss to the weights', the same on every rank."""
+        self.queries.backward(self.contrastive)
 
 
-def sample_batch(batch: PairBatch, config: TrainConfig, step: int, rank: int) -> SampledBatch:
-    """Draw which view is first, augment both, choose points; random numbers depend on (seed, step, rank) alone."""
-    generator = torch.Generator(batch.images1.device)
-    generator.manual_seed(derive_seed(config.seed, "step", step, "rank", rank))
-    swap = torch.rand(len(batch), generator=generator, device=generator.device) < 0.5
-    batch = batch.swapped(swap)
+def sample_batch(batch: PairBatch, config: TrainConfig, step: int, share: Share = WHOLE) -> SampledBatch:
+    """Draw which view is first, augment both, choose points.
+
+    Random numbers are a function of (seed, step) and of the pair's place in the global batch, of which this rank holds
+    `share`. They are drawn on the CPU, so that they are the same on any device and nothing waits for a GPU.
+    """
+    generator = torch.Generator().manual_seed(derive_seed(config.seed, "step", step))
+    swap, start = uniform_rows(len(batch), 2, generator, batch.points.device, share).unbind(1)
+    batch = batch.swapped(swap < 0.5)
     if config.pairs == "one_view_twice":
         batch = duplicate_view(batch)
-    return choose_cells(augment(batch, config.augmentation, generator), config.data.points, generator)
+    return choose_cells(augment(batch, config.augmentation, generator, share), config.data.points, start)
 
 
-def choose_cells(views: PairBatch, points: int, generator: torch.Generator) -> SampledBatch:
-    """Farthest point sampling on view 1; the feature cell of a pixel is floor(pixel / 4)."""
-    index, ok = farthest_points(views.points[..., :2], views.valid, points, generator)
+def choose_cells(views: PairBatch, points: int, start: Tensor | None = None) -> SampledBatch:
+    """Farthest point sampling on view 1, from `start` (B,) in [0, 1); the cell of a pixel is floor(pixel / 4)."""
+    index, ok = farthest_points(views.points[..., :2], views.valid, points, start)
     chosen = views.points.gather(1, index[..., None].expand(-1, -1, 4))  # (B, P, 4)
     height, width = (side // STRIDE for side in views.images1.shape[-2:])
     last = torch.tensor([width - 1, height - 1] * 2, device=chosen.device)
@@ -82,19 +80,25 @@ def choose_cells(views: PairBatch, points: int, generator: torch.Generator) -> S
     return SampledBatch(views, cells[..., [1, 0]], cells[..., [3, 2]], ok)
 
 
-def momentum_keys(momentum: MomentumEncoder, sampled: SampledBatch, ranks: Ranks, shuffle_seed: int | None) -> Tensor:
-    """Keys (world * B, P, D) of view 2 of all ranks.
+def momentum_keys(
+    momentum: MomentumEncoder, sampled: SampledBatch, ranks: Ranks, shuffle_seed: int | None, parts: list[slice]
+) -> Tensor:
+    """Keys (world * B, P, D) of view 2 of all ranks, encoded part by part of each rank's B images.
 
     With a seed, images are shuffled over the ranks before the momentum encoder and its keys unshuffled after, so that
     a key's BatchNorm statistics say nothing of its pair (MoCo, section 3.3).
     """
     images, cells = sampled.views.images2, sampled.cells2
-    if ranks.world == 1 or shuffle_seed is None:
-        return ranks.gather(momentum.sample(momentum(images), cells))
-    order = torch.randperm(len(images) * ranks.world, generator=torch.Generator().manual_seed(shuffle_seed))
-    order = order.to(images.device)
-    images, cells = (ranks.share(ranks.gather(tensor)[order]) for tensor in (images, cells))
-    return ranks.gather(momentum.sample(momentum(images), cells))[order.argsort()]
+    order: Tensor | None = None
+    if ranks.world > 1 and shuffle_seed is not None:
+        order = torch.randperm(len(images) * ranks.world, generator=torch.Generator().manual_seed(shuffle_seed))
+        order = order.to(images.device)
+        images, cells = (ranks.share(ranks.gather(tensor)[order]) for tensor in (images, cells))
+    encoded = [
+        momentum.sample(momentum(images[rows]), cells[rows]) for rows in moving_statistics_once(momentum.network, parts)
+    ]
+    keys = ranks.gather(torch.cat(encoded))
+    return keys if order is None else keys[order.argsort()]
 
 
 def compute_losses(
@@ -113,10 +117,12 @@ def compute_losses(
     `distributed.local_negatives`. A batch without a single valid point has contrastive loss 0.
     """
     device, size = sampled.ok.device, len(sampled.ok)
-    shuffle_seed = derive_seed(config.seed, "shuffle", step) if config.distributed.shuffle_batchnorm else None
-    with torch.autocast(device.type, torch.bfloat16, enabled=config.precision == "bf16"):
-        keys = momentum_keys(momentum, sampled, ranks, shuffle_seed)
-        queries, mask_logits = online(sampled.views.images1, sampled.cells1)
+    shuffles = config.distributed.shuffle_batchnorm and not config.distributed.sync_batchnorm
+    shuffle_seed = derive_seed(config.seed, "shuffle", step) if shuffles else None
+    parts = micro_batches(size, config.data.micro_batch)
+    with autocast(config.precision, device):
+        keys = momentum_keys(momentum, sampled, ranks, shuffle_seed, parts)
+    queries = Queries(online, sampled.views.images1, sampled.cells1, sampled.views.masks1, config, parts)
     all_ok, objects = ranks.gather(sampled.ok), ranks.gather(sampled.views.objects)
     n_points = sampled.ok.shape[1]
     pairs = torch.arange(len(all_ok), device=device)
@@ -128,8 +134,8 @@ def compute_losses(
     pair_of_key = pairs[:, None].expand(-1, n_points)[usable]
     query_pair = pairs[mine, None].expand(-1, n_points)[sampled.ok]
     contrastive = contrastive_loss(
-        queries[sampled.ok].float(),
-        keys[usable].float(),
+        queries.descriptors[sampled.ok],
+        keys[usable],
         key_of_point[mine][sampled.ok],
         query_pair,
         pair_of_key,
@@ -140,13 +146,9 @@ def compute_losses(
         chunk=config.loss.chunk,
         reduction="sum",
     )
-    # without a mask head the logits are constant: they have no gradient and their loss says nothing
-    with_mask = config.network.predict_mask and config.loss.mask_weight > 0
-    mask = mask_loss(mask_logits, sampled.views.masks1) if with_mask else torch.zeros((), device=device)
     count = all_ok.sum().clamp(min=1)
-    backward = contrastive * ranks.world / count + config.loss.mask_weight * mask
-    parts = [contrastive.detach(), sampled.ok.sum(), mask.detach(), torch.tensor(float(stop), device=device)]
-    total, points, masks, stops = ranks.sum(torch.stack([part.double() for part in parts])).tolist()
+    sums = [contrastive.detach(), sampled.ok.sum(), queries.mask.detach(), torch.tensor(float(stop), device=device)]
+    total, points, masks, stops = ranks.sum(torch.stack([value.double() for value in sums])).tolist()
     report = {"contrastive": total / max(1.0, points), "mask": masks / ranks.world, "points": points}
     loss = report["contrastive"] + config.loss.mask_weight * report["mask"]
-    return StepLosses(backward, {"loss": loss, **report}, stops > 0)
+    return StepLosses(queries, contrastive * ranks.world / count, {"loss": loss, **report}, stops > 0)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 from dope import damage, guard
+from dope.augmentation import Share
 from dope.common import files
 from dope.config import TrainConfig, check
 from dope.distributed import ranks_of
 from dope.heap import keep_heap
+from dope.memory import MemoryWatch
 from dope.meter import Meter
 from dope.profiling import StepProfiler
 from dope.run import open_run
@@ -58,21 +61,22 @@ def train(
         if stop_after is not None:
             last_step = min(last_step, state.step + stop_after)
         rows = run.order.batches(state.place, config.schedule.epochs, rank=ranks.rank, world=ranks.world)
-        pin = ranks.device.type == "cuda"
+        pin, share = ranks.device.type == "cuda", Share(ranks.rank, ranks.world)
         loader = PairLoader(run.dataset, rows, workers=config.data.workers, pin_memory=pin, fill_damaged=True)
-        online, meter = wrap(state.network, ranks), Meter(state.step)
+        online, meter = wrap(state.network, ranks, compiled=config.compile), Meter(state.step)
         with run.begin() as log, StepProfiler(out, profile, ranks, log.say) as profiler:
             stopping = state.step >= last_step
             for batch in meter.waiting_for(loader) if not stopping else ():
                 lr = learning_rate(config, state.step, run.order.steps_per_epoch)
                 for group in state.optimiser.param_groups:
                     group["lr"] = lr
-                sampled = sample_batch(batch.to(ranks.device), config, state.step, ranks.rank)
+                sampled = sample_batch(batch.to(ranks.device), config, state.step, share)
                 news = stop.requested or bool(batch.damaged)
-                losses = compute_losses(online, state.momentum, sampled, config, ranks, step=state.step, stop=news)
-                asked_to_stop = losses.stop and damage.heed(run, stop.requested, batch, log)
-                state.optimiser.zero_grad(set_to_none=True)
-                losses.backward.backward()
+                with MemoryWatch(online, ranks.device) if state.step == meter.first_step else nullcontext() as memory:
+                    losses = compute_losses(online, state.momentum, sampled, config, ranks, step=state.step, stop=news)
+                    asked_to_stop = losses.stop and damage.heed(run, stop.requested, batch, log)
+                    state.optimiser.zero_grad(set_to_none=True)
+                    losses.backward()
                 report = {**losses.report, "grad_norm": guard.gradient_norm(state.network.parameters()), "lr": lr}
                 guard.require_finite(run, report, batch, log)
                 state.optimiser.step()
@@ -80,6 +84,8 @@ def train(
 
                 state.step, state.place = state.step + 1, run.order.after(state.place)
                 stopping = asked_to_stop or state.step >= last_step
+                if memory is not None:
+                    log.event("memory", state.step, state.place.epoch, memory.report())
                 meter.add(config.data.batch_size, report["loss"])
                 profiler.step()
                 run.after_step(report, meter, log, stopping=stopping)

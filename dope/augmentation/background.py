@@ -8,19 +8,27 @@ import torch
 from torch import Tensor
 
 from dope.augmentation.config import AugmentationConfig
-from dope.augmentation.draws import Draws
+from dope.augmentation.draws import Draws, on_device
 
-COLUMNS = 9
+COLUMNS = 11
 
 
 @dataclass(frozen=True)
 class BackgroundPlan:
-    """For each view: two colours (n, 3) in 0 to 255, whether the gradient runs along x, and whether there is noise."""
+    """What each of n views gets in place of its background.
+
+    Attributes:
+        first, second: (n, 3) colours in 0 to 255.
+        horizontal: (n,) bool, whether the gradient runs along x.
+        noisy: (n,) bool, whether there is noise.
+        corner: (n, 2) in [0, 1), where the view's window of the noise lies, down and to the right.
+    """
 
     first: Tensor
     second: Tensor
     horizontal: Tensor
     noisy: Tensor
+    corner: Tensor
 
     def __getitem__(self, rows: slice | Tensor) -> BackgroundPlan:
         return BackgroundPlan(*(getattr(self, field.name)[rows] for field in fields(self)))
@@ -32,11 +40,25 @@ def draw_backgrounds(draws: Draws, config: AugmentationConfig) -> BackgroundPlan
     second = torch.stack([draws.integer((0, 255)) for _ in range(3)], 1).float()
     one_colour = draws.chance(config.one_colour_p)
     second = torch.where(one_colour[:, None], first, second)
-    return BackgroundPlan(first, second, draws.chance(0.5), draws.chance(config.noise_p))
+    horizontal, noisy = draws.chance(0.5), draws.chance(config.noise_p)
+    corner = torch.stack([draws.uniform((0.0, 1.0)), draws.uniform((0.0, 1.0))], 1)
+    return BackgroundPlan(first, second, horizontal, noisy, corner)
 
 
-def paint(plan: BackgroundPlan, height: int, width: int, noise: int, generator: torch.Generator) -> Tensor:
-    """Backgrounds (n, 3, H, W) uint8; the noise, U{0..noise-1} - U{0..noise-1}, wraps around at 0 and 255."""
+def noise_field(noise: int, height: int, width: int, generator: torch.Generator, device: torch.device) -> Tensor:
+    """Differences U{0..noise-1} - U{0..noise-1} of bytes with wrap-around, (3, 2 H, 2 W) uint8.
+
+    One field serves all views of a step, each by a window of its own: a pixel's noise has the same distribution as if
+    every view had its own field, for a fraction of the numbers, and all ranks can draw the same one.
+    """
+    on_it = on_device(generator, device)
+    shape = (2, 3, 2 * height, 2 * width)
+    plus, minus = torch.randint(noise, shape, dtype=torch.uint8, generator=on_it, device=device)
+    return plus.sub_(minus)
+
+
+def paint(plan: BackgroundPlan, height: int, width: int, field: Tensor | None) -> Tensor:
+    """Backgrounds (n, 3, H, W) uint8; the noise of `field` wraps around at 0 and 255."""
     device = plan.first.device
     x = torch.linspace(0, 1, width, device=device).expand(height, width)
     y = torch.linspace(0, 1, height, device=device)[:, None].expand(height, width)
@@ -44,8 +66,9 @@ def paint(plan: BackgroundPlan, height: int, width: int, noise: int, generator: 
     first, second = plan.first[:, :, None, None], plan.second[:, :, None, None]
     painted = torch.addcmul(first, second - first, ramp).to(torch.uint8)
     rows = plan.noisy.nonzero()[:, 0]
-    if len(rows) and noise > 0:
-        shape = (2, len(rows), 3, height, width)
-        plus, minus = torch.randint(noise, shape, dtype=torch.uint8, generator=generator, device=device)
-        painted[rows] += plus - minus
+    if field is not None and len(rows):
+        windows = field.unfold(1, height, 1).unfold(2, width, 1)  # (3, H + 1, W + 1, H, W), a view
+        top = (plan.corner[rows, 0] * (height + 1)).long()
+        left = (plan.corner[rows, 1] * (width + 1)).long()
+        painted[rows] += windows[:, top, left].transpose(0, 1)
     return painted

@@ -1,17 +1,39 @@
-"""Random numbers that are a function of the generator alone, wherever the images lie."""
+"""Random numbers that are a function of the generator alone: whatever the device, and whatever the number of ranks."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 
-class Draws:
-    """Columns of uniform numbers for `n` views, drawn in one call and moved to the images' device in one transfer."""
+@dataclass(frozen=True)
+class Share:
+    """Which of the `world` equal, contiguous parts of a global batch is meant: part `rank`, counted from 0."""
 
-    def __init__(self, n: int, columns: int, generator: torch.Generator, device: torch.device) -> None:
-        numbers = torch.rand(n, columns, generator=generator, device=generator.device).to(device)
-        self._columns = iter(numbers.unbind(1))
+    rank: int = 0
+    world: int = 1
+
+
+WHOLE = Share()
+
+
+def uniform_rows(n: int, columns: int, generator: torch.Generator, device: torch.device, share: Share) -> Tensor:
+    """(n, columns) float32 in [0, 1) on `device`: this share's rows of those of the whole global batch.
+
+    Every rank draws the rows of all ranks and keeps its own, so that N ranks get the numbers that one process gets.
+    They are few: some dozens a pair.
+    """
+    rows = torch.rand(share.world * n, columns, generator=generator, device=generator.device)
+    return rows[share.rank * n : (share.rank + 1) * n].to(device, non_blocking=True)
+
+
+class Draws:
+    """The columns of uniform numbers (n, columns), handed out one after the other as what n views need."""
+
+    def __init__(self, uniform: Tensor) -> None:
+        self._columns = iter(uniform.unbind(1))
 
     def chance(self, p: float) -> Tensor:
         """(n,) bool, True with probability `p`."""

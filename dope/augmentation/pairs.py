@@ -8,13 +8,16 @@ import torch
 from torch import Tensor
 
 from dope.augmentation.config import AugmentationConfig
+from dope.augmentation.draws import WHOLE, Draws, Share, uniform_rows
 from dope.augmentation.geometry import transform_points
-from dope.augmentation.views import augment_views, to_float
+from dope.augmentation.views import COLUMNS, augment_views, to_float
 from dope.batch import PairBatch
 
 
 @torch.no_grad()
-def augment(batch: PairBatch, config: AugmentationConfig, generator: torch.Generator) -> PairBatch:
+def augment(
+    batch: PairBatch, config: AugmentationConfig, generator: torch.Generator, share: Share = WHOLE
+) -> PairBatch:
     """Augment both views of every pair, each with draws of its own, on the batch's device.
 
     Background removal is drawn for the pair, from (yes, no), (no, yes) and twice (yes, yes). Points follow the pixels;
@@ -25,14 +28,19 @@ def augment(batch: PairBatch, config: AugmentationConfig, generator: torch.Gener
         batch: uint8 images, or float in [0, 1].
         config: probabilities and ranges.
         generator: the result is a function of it and of the batch; it may live on the CPU or on the batch's device.
+            On the CPU nothing waits for a GPU to draw.
+        share: which part of the global batch this is, where other ranks hold the others; with generators in the same
+            state on all ranks, each gets what one process with the whole batch would make of its part.
     """
-    option = torch.randint(4, (len(batch),), generator=generator, device=generator.device).to(batch.points.device)
+    uniform = uniform_rows(len(batch), 1 + 2 * COLUMNS, generator, batch.points.device, share)
+    option = (uniform[:, 0] * 4).long()
     remove = torch.cat([option != 1, option != 0]) & (config.background_removal == "paired")
     images, masks, matrices = augment_views(
         torch.cat([batch.images1, batch.images2]),
         torch.cat([batch.masks1, batch.masks2]),
         remove,
         config,
+        Draws(torch.cat(uniform[:, 1:].chunk(2, 1))),
         generator,
     )
     points = transform_points(torch.cat([batch.points[..., :2], batch.points[..., 2:]]), matrices)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from dope.augmentation import background, colour, geometry
 from dope.augmentation.config import AugmentationConfig
-from dope.augmentation.draws import Draws, on_device
+from dope.augmentation.draws import WHOLE, Draws, uniform_rows
 
 PIXELS_AT_ONCE = 1 << 18  # on CPUs: the few views at a time that stay in the cache between operations
 COLUMNS = 1 + colour.COLUMNS + geometry.COLUMNS + background.COLUMNS
@@ -28,28 +28,38 @@ def augment_images(
     Returns:
         images (B, 3, H, W) float32 in [0, 1] and masks (B, 1, H, W) bool.
     """
-    draw = torch.rand(len(images), generator=generator, device=generator.device).to(images.device)
-    remove = (draw < config.single_background_p) & (config.background_removal != "off")
-    new_images, new_masks, _ = augment_views(images, masks, remove, config, generator)
+    draws = Draws(uniform_rows(len(images), 1 + COLUMNS, generator, images.device, WHOLE))
+    remove = draws.chance(config.single_background_p) & (config.background_removal != "off")
+    new_images, new_masks, _ = augment_views(images, masks, remove, config, draws, generator)
     return new_images, new_masks
 
 
 @torch.no_grad()
 def augment_views(
-    images: Tensor, masks: Tensor, remove: Tensor, config: AugmentationConfig, generator: torch.Generator
+    images: Tensor,
+    masks: Tensor,
+    remove: Tensor,
+    config: AugmentationConfig,
+    draws: Draws,
+    generator: torch.Generator,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Change colours, flip, and where `remove` (n,): move the object and paint a new background.
+
+    Args:
+        draws: holds `COLUMNS` numbers a view; all that is drawn for a view comes from them.
+        generator: of the noise that all views share.
 
     Returns:
         images (n, 3, H, W) float32, masks (n, 1, H, W) bool, and the matrices (n, 3, 3) that map points of the old
         views to the new ones.
     """
     n, _, height, width = images.shape
-    draws = Draws(n, COLUMNS, generator, images.device)
-    noise_generator = on_device(generator, images.device)
     flip = draws.chance(config.flip_p)
     colours = colour.draw_colour(draws, config)
     backgrounds = background.draw_backgrounds(draws, config)
+    noise = None
+    if config.noise > 0 and config.noise_p > 0 and config.background_removal != "off":
+        noise = background.noise_field(config.noise, height, width, generator, images.device)
 
     remove = remove & masks.flatten(1).any(1)
     masks = torch.where(flip[:, None, None, None], masks.flip(-1), masks)
@@ -69,7 +79,7 @@ def augment_views(
                 )
             removing = remove[rows].nonzero()[:, 0]
             if len(removing):
-                painted = background.paint(backgrounds[start + removing], height, width, config.noise, noise_generator)
+                painted = background.paint(backgrounds[start + removing], height, width, noise)
                 part[removing] = torch.where(masks[start + removing], part[removing], to_float(painted))
             result[rows] = part
         matrices = moves @ geometry.flips(flip, width)

@@ -68,7 +68,8 @@ def query_cells(norms: NDArray[np.float32], key: str, config: MatchingConfig) ->
         return rng.choice(norms.size, config.points, replace=norms.size < config.points).astype(np.int64)
     cells = torch.from_numpy(np.stack(np.unravel_index(foreground, norms.shape), axis=1)).float()
     valid = torch.ones(1, len(cells), dtype=torch.bool)
-    chosen, _ = farthest_points(cells[None], valid, config.points, torch.Generator().manual_seed(seed))
+    start = torch.rand(1, generator=torch.Generator().manual_seed(seed))
+    chosen, _ = farthest_points(cells[None], valid, config.points, start)
     return foreground[chosen[0].numpy()]
 
 

@@ -24,7 +24,7 @@ class FeaturePyramid(nn.Module):
         """Map stages, finest first, to maps of the same sizes with `channels` channels."""
         merged = [lateral(stage) for lateral, stage in zip(self.lateral, stages, strict=True)]
         for i in range(len(merged) - 2, -1, -1):
-            merged[i] = merged[i] + F.interpolate(merged[i + 1], scale_factor=2.0, mode="nearest")
+            merged[i] = merged[i].add_(F.interpolate(merged[i + 1], scale_factor=2.0, mode="nearest"))
         return [output(x) for output, x in zip(self.output, merged, strict=True)]
 
 
@@ -62,4 +62,4 @@ class PanopticMerge(nn.Module):
     def forward(self, pyramid: Sequence[Tensor]) -> Tensor:
         """Map four maps at strides 4, 8, 16, 32 to one at stride 4."""
         maps = [branch(x) for branch, x in zip(self.branches, pyramid, strict=True)]
-        return maps[0] + maps[1] + maps[2] + maps[3]
+        return (maps[0] + maps[1]).add_(maps[2]).add_(maps[3])  # the maps themselves, ReLU needs again

@@ -15,18 +15,24 @@ class MomentumEncoder(nn.Module):
 
     BatchNorm stays in training mode with running statistics of its own, as in MoCo: keys are normalised with the
     statistics of their own batch.
+
+    Args:
+        network: what is copied.
+        momentum: share of the copy that stays at each update.
+        compiled: compile the copy's forward pass; names in the state dict stay.
     """
 
-    def __init__(self, network: DopeNetwork, momentum: float = 0.999) -> None:
+    def __init__(self, network: DopeNetwork, momentum: float = 0.999, *, compiled: bool = False) -> None:
         super().__init__()
         self.momentum = momentum
         self.network = copy.deepcopy(network).requires_grad_(False)
+        self._forward = torch.compile(self.network.forward) if compiled else self.network.forward
         self.train()
 
     @torch.no_grad()
     def forward(self, images: Tensor) -> NetworkOutput:
         """As `DopeNetwork.forward`, without gradient."""
-        return self.network(images)
+        return self._forward(images)
 
     @torch.no_grad()
     def sample(self, output: NetworkOutput, cells: Tensor) -> Tensor:

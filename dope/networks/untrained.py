@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from dope.common.seeds import derive_seed
+from dope.networks.batchnorm import batchnorms
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -42,7 +43,7 @@ def settle_batchnorm(network: nn.Module, images: Iterable[Tensor]) -> None:
 @contextmanager
 def _averaging(network: nn.Module) -> Iterator[None]:
     was_training = network.training
-    norms = [module for module in network.modules() if isinstance(module, nn.modules.batchnorm._BatchNorm)]
+    norms = batchnorms(network)
     momenta = [norm.momentum for norm in norms]
     try:
         network.eval()

@@ -10,6 +10,7 @@ import torch
 from tiny_runs import tiny
 
 from dope import trainer
+from dope.augmentation import Share
 from dope.common.errors import DopeError
 from dope.distributed import Ranks
 
@@ -20,19 +21,19 @@ def main(what: str, shards: Path, out: Path) -> None:
     seen: dict[str, Any] = {}
     real_sample, real_wrap = trainer.sample_batch, trainer.wrap
 
-    def sample(batch: Any, config: Any, step: int, rank: int) -> Any:
-        sampled = real_sample(batch, config, step, rank)
-        seen["step"], seen["rank"] = step, rank
-        if what == "loss" and step == 2 and rank == 1:
+    def sample(batch: Any, config: Any, step: int, share: Share) -> Any:
+        sampled = real_sample(batch, config, step, share)
+        seen["step"] = step
+        if what == "loss" and step == 2 and share.rank == 1:
             sampled.views.images1[0, 0, 0, 0] = float("nan")
         seen["weights"] = sum(float(p.detach().double().sum()) for p in seen["network"].parameters())
         return sampled
 
-    def wrap(network: Any, ranks: Ranks) -> torch.nn.Module:
+    def wrap(network: Any, ranks: Ranks, *, compiled: bool) -> torch.nn.Module:
         seen["network"] = network
         spoil = what == "gradient" and ranks.rank == 1
         next(network.parameters()).register_hook(lambda g: g * float("nan") if spoil and seen["step"] == 2 else g)
-        return real_wrap(network, ranks)
+        return real_wrap(network, ranks, compiled=compiled)
 
     trainer.sample_batch, trainer.wrap = sample, wrap
     try:

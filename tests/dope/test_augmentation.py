@@ -190,7 +190,7 @@ def test_float_images_give_what_bytes_give() -> None:
 
 
 def test_number_of_views_at_once_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    batch, config = make_batch(9), AugmentationConfig(noise_p=0.0)
+    batch, config = make_batch(9), AugmentationConfig()
     whole = augment(batch, config, seeded())
     monkeypatch.setattr(views, "PIXELS_AT_ONCE", 1)
     single = augment(batch, config, seeded())

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dope.augmentation import AugmentationConfig
 from dope.augmentation.background import COLUMNS as BACKGROUND_COLUMNS
-from dope.augmentation.background import BackgroundPlan, draw_backgrounds, paint
+from dope.augmentation.background import BackgroundPlan, draw_backgrounds, noise_field, paint
 from dope.augmentation.colour import COLUMNS as COLOUR_COLUMNS
 from dope.augmentation.colour import (
     OPERATIONS,
@@ -34,7 +34,7 @@ CONFIG = AugmentationConfig()
 
 
 def draws(columns: int, n: int = N) -> Draws:
-    return Draws(n, columns, torch.Generator().manual_seed(0), torch.device("cpu"))
+    return Draws(torch.rand(n, columns, generator=torch.Generator().manual_seed(0)))
 
 
 def some_images(n: int) -> Tensor:
@@ -111,6 +111,7 @@ def test_background_draws_have_the_configured_probabilities() -> None:
     one_colour = (plan.first == plan.second).all(1)
     shares = [x.float().mean().item() for x in (one_colour, plan.horizontal[~one_colour], plan.noisy)]
     assert shares == pytest.approx([0.5, 0.5, 0.5], abs=0.03)
+    assert plan.corner.mean(0).tolist() == pytest.approx([0.5, 0.5], abs=0.03)
     for colours in (plan.first, plan.second):
         assert colours.min() == 0 and colours.max() == 255
         assert colours.mean().item() == pytest.approx(127.5, abs=3)
@@ -118,8 +119,8 @@ def test_background_draws_have_the_configured_probabilities() -> None:
 
 def test_gradients_run_from_one_colour_to_the_other() -> None:
     first, second = torch.tensor([[0.0, 250.0, 9.0]] * 2), torch.tensor([[200.0, 50.0, 9.0]] * 2)
-    plan = BackgroundPlan(first, second, torch.tensor([True, False]), torch.tensor([False, False]))
-    along_x, along_y = paint(plan, 11, 11, 50, torch.Generator())
+    plan = BackgroundPlan(first, second, torch.tensor([True, False]), torch.tensor([False, False]), torch.zeros(2, 2))
+    along_x, along_y = paint(plan, 11, 11, None)
     assert along_x[0, 5].tolist() == list(range(0, 201, 20))
     assert along_x[1, 0].tolist() == list(range(250, 49, -20))
     assert (along_x[2] == 9).all() and (along_x == along_x[:, :1]).all()
@@ -127,15 +128,26 @@ def test_gradients_run_from_one_colour_to_the_other() -> None:
 
 
 def test_noise_is_the_difference_of_two_uniform_numbers_with_wrap_around() -> None:
-    black = torch.zeros(2, 3)
-    plan = BackgroundPlan(black, black, torch.tensor([True, True]), torch.tensor([True, False]))
-    noisy, clean = paint(plan, 200, 200, 50, torch.Generator().manual_seed(0))
-    assert not clean.any()
-    signed = noisy.flatten().to(torch.int8).long()  # 8-bit wrap-around: 255 is -1
+    field = noise_field(50, 100, 100, torch.Generator().manual_seed(0), torch.device("cpu"))
+    assert field.shape == (3, 200, 200)
+    signed = field.flatten().to(torch.int8).long()  # 8-bit wrap-around: 255 is -1
     assert signed.min() == -49 and signed.max() == 49
     share = torch.bincount(signed + 49) / signed.numel()
     triangle = (50 - torch.arange(-49, 50).abs()) / 2500
     torch.testing.assert_close(share, triangle, atol=1.5e-3, rtol=0)
+    largest = noise_field(256, 50, 50, torch.Generator().manual_seed(0), torch.device("cpu"))
+    assert largest.float().mean().item() == pytest.approx(127.5, abs=3)  # uniform again, once it has wrapped around
+
+
+def test_each_noisy_view_gets_its_window_of_the_noise() -> None:
+    field = torch.arange(3 * 8 * 12).view(3, 8, 12).to(torch.uint8)
+    colour = torch.full((3, 3), 200.0)
+    corner = torch.tensor([[0.0, 0.0], [0.999, 0.999], [0.5, 0.5]])
+    noisy = torch.tensor([True, True, False])
+    views = paint(BackgroundPlan(colour, colour, noisy, noisy, corner), 4, 6, field)
+    assert torch.equal(views[0], field[:, :4, :6] + 200)  # in 8 bits
+    assert torch.equal(views[1], field[:, 4:, 6:] + 200)
+    assert (views[2] == 200).all()
 
 
 def test_bounding_boxes_are_pixel_edges() -> None:

@@ -10,6 +10,7 @@ from tiny_runs import losses_of, tiny
 from tiny_shards import write_shards
 
 from dope import guard, trainer
+from dope.augmentation import Share
 from dope.checkpoints import list_checkpoints, load_network
 from dope.common.errors import BadInput, DopeError, UsageError
 from dope.config import TrainConfig
@@ -155,8 +156,8 @@ def test_a_loss_that_is_not_finite_stops_with_step_and_samples(
 ) -> None:
     real = trainer.sample_batch
 
-    def poisoned(batch: object, config: TrainConfig, step: int, rank: int) -> object:
-        sampled = real(batch, config, step, rank)  # type: ignore[arg-type]
+    def poisoned(batch: object, config: TrainConfig, step: int, share: Share) -> object:
+        sampled = real(batch, config, step, share)  # type: ignore[arg-type]
         if step == 2:
             sampled.views.images1[0, 0, 0, 0] = float("nan")
         return sampled

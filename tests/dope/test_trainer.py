@@ -13,10 +13,11 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from many_ranks import part
 from tiny_runs import TINY, losses_of, tiny
 from tiny_shards import write_shards
 
-from dope.augmentation import no_augmentation
+from dope.augmentation import Share, no_augmentation
 from dope.batch import PairBatch
 from dope.checkpoints import list_checkpoints, load_network
 from dope.common.errors import BadInput, UsageError
@@ -29,6 +30,7 @@ from dope.streaming import PairDataset, collate
 from dope.trainer import train
 
 ALONE = Ranks(0, 1, torch.device("cpu"))
+STARTS = torch.tensor([0.1, 0.9, 0.4, 0.6])  # where the farthest point sampling of four pairs begins
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +150,7 @@ def test_damaged_shards_stop_before_the_first_step(shards: Path, tmp_path: Path)
 def test_every_ablation_trains(shards: Path, pairs: str, negatives: str, predict_mask: bool) -> None:
     config = tiny(f"pairs={pairs}", f"loss.negatives={negatives}", f"network.predict_mask={predict_mask}".lower())
     state, losses = one_step(shards, config)
-    losses.backward.backward()
+    losses.backward()
     gradients = [p.grad for p in state.network.parameters()]
     assert all(g is not None and torch.isfinite(g).all() for g in gradients)
     assert sum(float(g.abs().sum()) for g in gradients if g is not None) > 0
@@ -159,7 +161,7 @@ def test_half_precision_gives_nearly_the_same_loss_and_full_gradients(shards: Pa
     reports = []
     for precision in ("fp32", "bf16"):
         state, losses = one_step(shards, tiny(f"precision={precision}"))
-        losses.backward.backward()
+        losses.backward()
         assert all(p.grad is not None and p.grad.dtype == torch.float32 for p in state.network.parameters())
         reports.append(losses.report["loss"])
     assert reports[0] != reports[1] and reports[0] == pytest.approx(reports[1], rel=0.05)
@@ -172,9 +174,9 @@ def test_pairs_without_valid_points_do_no_harm(shards: Path) -> None:
     half[0] = False
     for valid, points in ((half, 24), (none, 0)):
         state = new_state(config, ALONE)
-        sampled = choose_cells(no_augmentation(replace(batch, valid=valid)), config.data.points, torch.Generator())
+        sampled = choose_cells(no_augmentation(replace(batch, valid=valid)), config.data.points)
         losses = compute_losses(wrap(state.network, ALONE), state.momentum, sampled, config, ALONE)
-        losses.backward.backward()
+        losses.backward()
         assert losses.report["points"] == points and math.isfinite(losses.report["loss"])
         assert all(p.grad is None or bool(torch.isfinite(p.grad).all()) for p in state.network.parameters())
 
@@ -183,7 +185,7 @@ def test_the_loss_is_the_mean_over_points_by_a_naive_loop(shards: Path) -> None:
     config = tiny()
     state, batch = new_state(config, ALONE), batch_of(shards, config)
     batch.valid[1, 3:] = False  # three points only
-    sampled = choose_cells(no_augmentation(batch), config.data.points, torch.Generator().manual_seed(0))
+    sampled = choose_cells(no_augmentation(batch), config.data.points, STARTS)
     report = compute_losses(wrap(state.network, ALONE), state.momentum, sampled, config, ALONE).report
     first = state.network(sampled.views.images1)
     queries = state.network.sample(first, sampled.cells1)
@@ -205,7 +207,7 @@ def test_the_loss_is_the_mean_over_points_by_a_naive_loop(shards: Path) -> None:
 
 def test_cells_hold_their_points(shards: Path) -> None:
     config = tiny()
-    sampled = sample_batch(batch_of(shards, config), config, step=3, rank=0)
+    sampled = sample_batch(batch_of(shards, config), config, step=3)
     views = sampled.views
     for b in range(4):
         first = {(int(y // 4), int(x // 4)) for x, y, _, _ in views.points[b][views.valid[b]].tolist()}
@@ -221,7 +223,7 @@ def test_points_are_the_farthest_in_view_1(shards: Path) -> None:
     corners = torch.tensor([[1.0, 1.0], [31.0, 1.0], [1.0, 31.0], [31.0, 31.0]])
     batch.points[:, [5, 20, 30, 40], :2] = corners
     batch.valid[:] = True
-    sampled = choose_cells(no_augmentation(batch), 5, torch.Generator().manual_seed(0))
+    sampled = choose_cells(no_augmentation(batch), 5, STARTS)
     for cells in sampled.cells1.tolist():
         assert {(0, 0), (0, 7), (7, 0), (7, 7)} <= {tuple(cell) for cell in cells}
 
@@ -230,18 +232,27 @@ def test_either_view_may_be_the_first(shards: Path) -> None:
     config = tiny("augmentation.colour_p=0", "augmentation.flip_p=0", "augmentation.background_removal=off")
     batch = batch_of(shards, config)
     same = [
-        torch.equal(sample_batch(batch, config, step, 0).views.images1[0], batch.images1[0].float() / 255)
+        torch.equal(sample_batch(batch, config, step).views.images1[0], batch.images1[0].float() / 255)
         for step in range(20)
     ]
     assert 4 <= sum(same) <= 16
 
 
-def test_random_numbers_depend_on_step_and_rank(shards: Path) -> None:
-    config = tiny()
+@pytest.mark.parametrize("pairs", ["two_views", "one_view_twice"])
+def test_random_numbers_are_a_function_of_seed_step_and_place_in_the_global_batch(shards: Path, pairs: str) -> None:
+    config = tiny(f"pairs={pairs}", "augmentation.geometry_p=1", "augmentation.noise_p=1")
     batch = batch_of(shards, config)
-    images = {key: sample_batch(batch, config, *key).views.images1 for key in ((0, 0), (1, 0), (0, 1))}
-    assert torch.equal(images[0, 0], sample_batch(batch, config, 0, 0).views.images1)
-    assert not torch.equal(images[0, 0], images[1, 0]) and not torch.equal(images[0, 0], images[0, 1])
+    whole, again = sample_batch(batch, config, 0), sample_batch(batch, config, 0)
+    assert torch.equal(whole.views.images1, again.views.images1)
+    assert not torch.equal(whole.views.images1, sample_batch(batch, config, 1).views.images1)
+    assert not torch.equal(whole.views.images1, sample_batch(batch, replace(config, seed=1), 0).views.images1)
+    for world in (2, 4):
+        parts = [sample_batch(part(batch, r, world), config, 0, Share(r, world)) for r in range(world)]
+        for name in ("images1", "images2", "masks1", "masks2", "points", "valid"):
+            joined = torch.cat([getattr(part.views, name) for part in parts])
+            torch.testing.assert_close(joined, getattr(whole.views, name), atol=1e-6, rtol=0)
+        for name in ("cells1", "cells2", "ok"):
+            assert torch.equal(torch.cat([getattr(part, name) for part in parts]), getattr(whole, name)), name
 
 
 def test_the_momentum_encoder_follows_after_the_step(shards: Path, tmp_path: Path) -> None:
@@ -332,7 +343,7 @@ def batch_of(shards: Path, config: TrainConfig) -> PairBatch:
 
 def one_step(shards: Path, config: TrainConfig) -> tuple[TrainState, StepLosses]:
     state = new_state(config, ALONE)
-    sampled = sample_batch(batch_of(shards, config), config, step=0, rank=0)
+    sampled = sample_batch(batch_of(shards, config), config, step=0)
     return state, compute_losses(wrap(state.network, ALONE), state.momentum, sampled, config, ALONE)
 
 
