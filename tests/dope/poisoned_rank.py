@@ -23,7 +23,7 @@ def main(what: str, shards: Path, out: Path) -> None:
 
     def sample(batch: Any, config: Any, step: int, share: Share) -> Any:
         sampled = real_sample(batch, config, step, share)
-        seen["step"] = step
+        seen["step"], seen["rank"] = step, share.rank
         if what == "loss" and step == 2 and share.rank == 1:
             sampled.views.images1[0, 0, 0, 0] = float("nan")
         seen["weights"] = sum(float(p.detach().double().sum()) for p in seen["network"].parameters())

@@ -188,10 +188,10 @@ def test_a_gradient_that_is_not_finite_stops_before_it_reaches_the_weights(
         before.update(weights)
         return gradient if len(networks) < 3 else gradient * float("inf")
 
-    def hooked(network: torch.nn.Module, ranks: Ranks) -> torch.nn.Module:
+    def hooked(network: torch.nn.Module, ranks: Ranks, *, compiled: bool) -> torch.nn.Module:
         networks.append(network)
         next(network.parameters()).register_hook(overflowing)
-        return wrap(network, ranks)  # type: ignore[arg-type]
+        return wrap(network, ranks, compiled=compiled)  # type: ignore[arg-type]
 
     monkeypatch.setattr(trainer, "wrap", hooked)
     with pytest.raises(DopeError, match=r"the norm of the gradient is (inf|nan) at step 2 \(loss \d.*object_00"):
