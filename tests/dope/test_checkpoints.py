@@ -70,7 +70,7 @@ def test_load_network_is_ready_to_evaluate_and_says_where_it_comes_from(run: Pat
     assert meta["config"]["network"]["projector"] == (8, 4)
     images = torch.rand(1, 3, 32, 32)
     expected = trained().network.eval().descriptors(images)
-    torch.testing.assert_close(network.descriptors(images), expected, atol=1e-6, rtol=0)  # of another memory layout
+    torch.testing.assert_close(network.descriptors(images), expected, atol=1e-5, rtol=0)  # of another memory layout
     direct = load_network(Path(meta["path"]))[1]
     assert direct["sha256"] == meta["sha256"]
 
