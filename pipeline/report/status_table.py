@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import os
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Mapping
 from functools import partial
-from itertools import islice
-from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -18,13 +14,8 @@ import pyarrow.parquet as pq
 
 from dope.common import files
 from dope.common.errors import BadInput
-from pipeline.engines import default_workers
+from pipeline.engines import read_spread
 from pipeline.report.status_row import SCHEMA, refused_row, sequence_row
-
-BATCH = 2000
-"""Sequences that become columns at a time: a row as a dict takes thirty times the memory of its place in a column."""
-SPREAD_FROM = 4 * BATCH
-"""From this many folders on, several processes read: parsing JSON keeps Python's lock."""
 
 FORMULA = r"\A([=+\-@\t\r])"
 """How a text begins that spreadsheets run: names of folders come from strangers' disks."""
@@ -56,11 +47,10 @@ def read_work(work: Path, progress: Progress) -> pa.Table:
         raise BadInput(f"cannot be read ({error.strerror})", where=work) from error
     items = [(name, bool(held) and _is_held(f"{work}/{name}/.lock", held)) for name in names]
     read = partial(_read_batch, str(work))
-    batches = list(_chunks(items, BATCH))
     tables, done = [], 0
-    for batch, table in zip(batches, _spread(read, batches, len(items)), strict=True):
+    for number, table in read_spread(read, items):
         tables.append(table)
-        done += len(batch)
+        done += number
         progress("sequences", done, len(items))
     table = pa.concat_tables([SCHEMA.empty_table(), *tables])
     refused = [refused_row(str(work), path.stem) for path in sorted(work.glob(".refused/[!.]*.json"))]
@@ -150,21 +140,6 @@ def _is_held(path: str, held: Held) -> bool:
 def _read_batch(work: str, items: list[Item]) -> pa.Table:
     rows = [row for name, running in items if (row := sequence_row(work, name, running=running)) is not None]
     return pa.Table.from_pydict({name: [row[name] for row in rows] for name in SCHEMA.names}, schema=SCHEMA)
-
-
-def _spread(read: Callable[[list[Item]], pa.Table], batches: list[list[Item]], total: int) -> Iterator[pa.Table]:
-    workers = min(default_workers(), 8)
-    if total < SPREAD_FROM or workers < 2:
-        yield from map(read, batches)
-        return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        yield from pool.map(read, batches)
-
-
-def _chunks(items: list[Any], size: int) -> Iterator[list[Any]]:
-    iterator = iter(items)
-    while chunk := list(islice(iterator, size)):
-        yield chunk
 
 
 def _mark_duplicates(table: pa.Table) -> pa.Table:

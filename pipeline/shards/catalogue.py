@@ -5,12 +5,14 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dope.common.errors import BadInput
 from pipeline.correspond.outline import Outline, read_outline
+from pipeline.engines import read_spread
 from pipeline.sequence import Sequence
 from pipeline.shards.writer import SequenceContents
 from pipeline.stages import LATER_STAGES, StageResult, read_marker
@@ -77,32 +79,51 @@ def read_catalogue(sequences: Iterable[Sequence]) -> tuple[Catalogue, list[list[
     Raises:
         BadInput: two sequences have the same id.
     """
-    entries: list[tuple[Sequence, str, str | None, Outline]] = []
-    marks: list[list[str | None]] = []
-    left_out: dict[str, str] = {}
     ordered = sorted(sequences, key=lambda sequence: sequence.id)
     for before, after in itertools.pairwise(ordered):
         if before.id == after.id:
             raise BadInput(
                 f"has the same id as {before.folder}", where=after.folder, remedy="Rename one of the folders"
             )
-    for sequence in ordered:
-        marker = read_marker(sequence, "correspond")
-        if marker is None or not marker.ok:
-            left_out[sequence.id] = _why_not(sequence, marker)
-        else:
-            try:
-                outline = _outline(sequence, marker)
-                info = sequence.read_info()
-            except BadInput as error:
-                left_out[sequence.id] = str(error)
-                continue
-            instance = info.instance or sequence.id
-            entries.append((sequence, instance, info.category, outline))
-            # the content, too: the same settings may have given something else (another version, more threads)
-            content = marker.details.get("content")
-            marks.append([sequence.id, marker.fingerprint, content, info.category, instance])
+    entries: list[tuple[Sequence, str, str | None, Outline]] = []
+    marks: list[list[str | None]] = []
+    left_out: dict[str, str] = {}
+    for _, found in read_spread(_read_entries, [sequence.folder for sequence in ordered]):
+        for folder, entry in found:
+            sequence = Sequence(folder)
+            if isinstance(entry, str):
+                left_out[sequence.id] = entry
+            else:
+                entries.append((sequence, entry.instance, entry.category, entry.outline))
+                marks.append([sequence.id, entry.fingerprint, entry.content, entry.category, entry.instance])
     return make_catalogue(entries), marks, left_out
+
+
+@dataclass(frozen=True)
+class _Entry:
+    instance: str
+    category: str | None
+    outline: Outline
+    fingerprint: str
+    content: str | None
+    """What was written: the same settings may have given something else (another version, more threads)."""
+
+
+def _read_entries(folders: list[Path]) -> list[tuple[Path, _Entry | str]]:
+    """Each sequence's entry, or why it cannot be packed."""
+    return [(folder, _read_entry(Sequence(folder))) for folder in folders]
+
+
+def _read_entry(sequence: Sequence) -> _Entry | str:
+    marker = read_marker(sequence, "correspond")
+    if marker is None or not marker.ok:
+        return _why_not(sequence, marker)
+    try:
+        outline, info = _outline(sequence, marker), sequence.read_info()
+    except BadInput as error:
+        return str(error)
+    content = marker.details.get("content")
+    return _Entry(info.instance or sequence.id, info.category, outline, marker.fingerprint, content)
 
 
 def _why_not(sequence: Sequence, marker: StageResult | None) -> str:

@@ -17,11 +17,14 @@ from typer.testing import CliRunner
 
 import cli
 from dope.common.errors import BadInput, UsageError
+from pipeline import engines
 from pipeline.report import status_table
 from pipeline.report.filters import parse_condition, select, sort_rows
 from pipeline.report.status_row import NAMES, SCHEMA
 from pipeline.report.status_table import held_files, read_status, write_csv, write_parquet
 from pipeline.report.status_text import kind_of_reason, lines_of, summary
+from pipeline.sequence import Sequence
+from pipeline.shards.catalogue import read_catalogue
 
 
 def rows_of(*places: Path) -> dict[str, dict[str, Any]]:
@@ -170,14 +173,29 @@ def test_other_folders_and_files_are_no_sequences(tmp_path: Path) -> None:
     assert list(rows_of(tmp_path)) == ["cup"]
 
 
+def spread_from_four(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two processes read, two items at a time, where there are four or more."""
+    monkeypatch.setattr(engines, "BATCH", 2)
+    monkeypatch.setattr(engines, "SPREAD_FROM", 4)
+    monkeypatch.setattr(engines, "default_workers", lambda: 2)
+
+
 def test_several_processes_read_the_same_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for i in range(7):
         write_files(tmp_path / f"cup_{i}", i % 5 + 1)
     alone = read_status([tmp_path])
-    monkeypatch.setattr(status_table, "BATCH", 2)
-    monkeypatch.setattr(status_table, "SPREAD_FROM", 4)
-    monkeypatch.setattr(status_table, "default_workers", lambda: 2)
+    spread_from_four(monkeypatch)
     assert read_status([tmp_path]).equals(alone)
+
+
+def test_several_processes_read_the_same_catalogue(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of sequences that cannot be packed, each with its reason."""
+    for i in range(7):
+        write_files(tmp_path / f"cup_{i}", i % 4 + 1)
+    sequences = [Sequence(path) for path in sorted(tmp_path.iterdir())]
+    alone = read_catalogue(sequences)
+    spread_from_four(monkeypatch)
+    assert len(alone[2]) == 7 and read_catalogue(sequences)[1:] == alone[1:]
 
 
 def test_status_of_other_machines_is_merged_and_duplicates_are_marked(tmp_path: Path) -> None:
