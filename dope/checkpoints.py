@@ -6,7 +6,7 @@
       latest                    the name of the newest one
       best                      with checkpoint.keep_best: the name of the one with the best PCK, and that PCK
 
-Nothing random is stored: every random number derives from (seed, step, rank). Files are written in this order and only
+Nothing random is stored: every random number derives from (seed, step). Files are written in this order and only
 then are old ones deleted, so that a crash at any moment leaves a checkpoint that `latest` or the list of files finds.
 """
 
