@@ -74,9 +74,11 @@ def loader(given: argparse.Namespace) -> None:
 
     from dope.augmentation import WHOLE
     from dope.config import load_config
+    from dope.heap import keep_heap
     from dope.step import sample_batch
     from dope.streaming import PairDataset, PairLoader
 
+    keep_heap()
     with tempfile.TemporaryDirectory() as scratch:
         dataset = PairDataset(given.shards or made_shards(Path(scratch)), "train")
         size, rows = 16, np.arange(len(dataset))
@@ -97,7 +99,7 @@ def loader(given: argparse.Namespace) -> None:
 def made_shards(folder: Path) -> Path:
     from tests.dope.tiny_shards import write_shards  # the shards of the tests, at the paper's size
 
-    return write_shards(folder, n_objects=64, pairs=4, size=224, n_points=6000, per_shard=64)
+    return write_shards(folder, n_objects=64, pairs=4, size=224, n_points=600, per_shard=64)
 
 
 def loss(given: argparse.Namespace) -> None:
@@ -147,7 +149,7 @@ def _loss_of(name: str, rounds: int) -> dict[str, float]:
         "seconds": round(seconds, 3),
         "mib": round(peak_mib() - start),
         "tables_mib": round(start - before),
-        "loss": float(value),
+        "loss": value.item(),
         "gradient": float(queries.grad.norm()),
     }
 

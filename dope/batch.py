@@ -60,13 +60,15 @@ class PairBatch:
 
     def swapped(self, swap: Tensor) -> PairBatch:
         """Exchange the two views of the pairs where `swap` (B,) bool is True."""
-        wide = swap[:, None, None, None]
+        own = torch.arange(len(self), device=swap.device)
+        first, second = torch.where(swap, own + len(self), own), torch.where(swap, own, own + len(self))
+        images, masks = torch.cat([self.images1, self.images2]), torch.cat([self.masks1, self.masks2])
         return replace(
             self,
-            images1=torch.where(wide, self.images2, self.images1),
-            images2=torch.where(wide, self.images1, self.images2),
-            masks1=torch.where(wide, self.masks2, self.masks1),
-            masks2=torch.where(wide, self.masks1, self.masks2),
+            images1=images.index_select(0, first),
+            images2=images.index_select(0, second),
+            masks1=masks.index_select(0, first),
+            masks2=masks.index_select(0, second),
             points=torch.where(swap[:, None, None], self.points[..., [2, 3, 0, 1]], self.points),
         )
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dope.augmentation.config import AugmentationConfig
-from dope.augmentation.draws import Draws, on_device
+from dope.augmentation.draws import Draws, on_device, rows_where
 
 COLUMNS = 11
 
@@ -46,29 +46,36 @@ def draw_backgrounds(draws: Draws, config: AugmentationConfig) -> BackgroundPlan
 
 
 def noise_field(noise: int, height: int, width: int, generator: torch.Generator, device: torch.device) -> Tensor:
-    """Differences U{0..noise-1} - U{0..noise-1} of bytes with wrap-around, (3, 2 H, 2 W) uint8.
+    """Differences U{0..noise-1} - U{0..noise-1} of bytes with wrap-around, (3, H + H / 4, W + W / 4) uint8.
 
     One field serves all views of a step, each by a window of its own: a pixel's noise has the same distribution as if
     every view had its own field, for a fraction of the numbers, and all ranks can draw the same one.
     """
     on_it = on_device(generator, device)
-    shape = (2, 3, 2 * height, 2 * width)
+    shape = (2, 3, height + height // 4, width + width // 4)
     plus, minus = torch.randint(noise, shape, dtype=torch.uint8, generator=on_it, device=device)
     return plus.sub_(minus)
 
 
 def paint(plan: BackgroundPlan, height: int, width: int, field: Tensor | None) -> Tensor:
     """Backgrounds (n, 3, H, W) uint8; the noise of `field` wraps around at 0 and 255."""
-    device = plan.first.device
-    x = torch.linspace(0, 1, width, device=device).expand(height, width)
-    y = torch.linspace(0, 1, height, device=device)[:, None].expand(height, width)
-    ramp = torch.where(plan.horizontal[:, None, None], x, y)[:, None]
-    first, second = plan.first[:, :, None, None], plan.second[:, :, None, None]
-    painted = torch.addcmul(first, second - first, ramp).to(torch.uint8)
-    rows = plan.noisy.nonzero()[:, 0]
-    if field is not None and len(rows):
-        windows = field.unfold(1, height, 1).unfold(2, width, 1)  # (3, H + 1, W + 1, H, W), a view
-        top = (plan.corner[rows, 0] * (height + 1)).long()
-        left = (plan.corner[rows, 1] * (width + 1)).long()
-        painted[rows] += windows[:, top, left].transpose(0, 1)
+    device, n = plan.first.device, len(plan.first)
+    x, y = (torch.linspace(0, 1, side, device=device) for side in (width, height))
+    first, step = plan.first[:, :, None], (plan.second - plan.first)[:, :, None]
+    across = torch.addcmul(first, step, x).to(torch.uint8)[:, :, None].expand(n, 3, height, width)
+    down = torch.addcmul(first, step, y).to(torch.uint8)[..., None].expand(n, 3, height, width)
+    horizontal = rows_where(plan.horizontal)
+    painted = across if isinstance(horizontal, slice) else down
+    if isinstance(horizontal, Tensor):
+        painted = torch.where(plan.horizontal[:, None, None, None], across, down)
+    rows = rows_where(plan.noisy)
+    if field is None or rows is None:
+        return painted
+    windows = field.unfold(1, height, 1).unfold(2, width, 1)  # (3, places down, places across, H, W), a view
+    top, left = (plan.corner[rows] * torch.tensor(windows.shape[1:3], device=device)).long().unbind(1)
+    noise = windows[:, top, left].transpose(0, 1)
+    if isinstance(rows, slice):
+        return painted + noise
+    painted = painted.clone()
+    painted[rows] += noise
     return painted

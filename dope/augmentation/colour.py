@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from dope.augmentation.config import AugmentationConfig
-from dope.augmentation.draws import Draws
+from dope.augmentation.draws import Draws, rows_where
 
 GREY = (0.2989, 0.587, 0.114)  # ITU-R BT.601, as torchvision rounds it
 OPERATIONS = ("hue", "saturation", "brightness", "gamma", "contrast")  # in the order of application
@@ -39,10 +39,10 @@ def draw_colour(draws: Draws, config: AugmentationConfig) -> ColourPlan:
 def change_colours(images: Tensor, plan: ColourPlan) -> None:
     """Apply each operation to the images (n, 3, H, W) that were chosen for it, in place."""
     for operation, chosen, amount in zip(FUNCTIONS, plan.chosen, plan.amount, strict=True):
-        rows = chosen.nonzero()[:, 0]
-        if len(rows) == len(images):
+        rows = rows_where(chosen)
+        if isinstance(rows, slice):
             operation(images, amount)
-        elif len(rows):
+        elif rows is not None:
             some = images[rows]
             operation(some, amount[rows])
             images[rows] = some

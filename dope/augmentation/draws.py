@@ -56,3 +56,14 @@ def on_device(generator: torch.Generator, device: torch.device) -> torch.Generat
         return generator
     seed = torch.randint(2**62, (), generator=generator, device=generator.device)
     return torch.Generator(device).manual_seed(int(seed))
+
+
+Rows = slice | Tensor
+
+
+def rows_where(flags: Tensor) -> Rows | None:
+    """The rows where `flags` (n,) bool is True, to index with: a slice where all are, so that nothing is copied."""
+    rows = flags.nonzero()[:, 0]
+    if len(rows) == 0:
+        return None
+    return slice(None) if len(rows) == len(flags) else rows

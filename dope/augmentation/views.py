@@ -7,9 +7,9 @@ from torch import Tensor
 
 from dope.augmentation import background, colour, geometry
 from dope.augmentation.config import AugmentationConfig
-from dope.augmentation.draws import WHOLE, Draws, uniform_rows
+from dope.augmentation.draws import WHOLE, Draws, rows_where, uniform_rows
 
-PIXELS_AT_ONCE = 1 << 18  # on CPUs: the few views at a time that stay in the cache between operations
+PIXELS_AT_ONCE = 1 << 16  # on CPUs: so few views at a time stay in the cache between operations, one of 224 px
 COLUMNS = 1 + colour.COLUMNS + geometry.COLUMNS + background.COLUMNS
 
 
@@ -61,29 +61,44 @@ def augment_views(
     if config.noise > 0 and config.noise_p > 0 and config.background_removal != "off":
         noise = background.noise_field(config.noise, height, width, generator, images.device)
 
-    remove = remove & masks.flatten(1).any(1)
-    masks = torch.where(flip[:, None, None, None], masks.flip(-1), masks)
-    moves, moved, scales = geometry.draw_moves(draws, masks, remove & config.geometry, config)
+    masks = mirrored(masks, flip)
+    boxes, present = geometry.bounding_boxes(masks)
+    remove = remove & present
+    moves, moved, scales = geometry.draw_moves(draws, masks, boxes, remove & config.geometry, config)
 
     result = torch.empty(images.shape, dtype=torch.float32, device=images.device)
     at_once = n if images.is_cuda else max(1, PIXELS_AT_ONCE // (height * width))
     with torch.autocast(images.device.type, enabled=False):
         for start in range(0, n, at_once):
             rows = slice(start, start + at_once)
-            part = to_float(torch.where(flip[rows, None, None, None], images[rows].flip(-1), images[rows]))
+            part, mask = result[rows], masks[rows]
+            part.copy_(to_float(mirrored(images[rows], flip[rows])))
             colour.change_colours(part, colours[rows])
-            moving = moved[rows].nonzero()[:, 0]
-            if len(moving):
-                part[moving], masks[start + moving] = geometry.warp(
-                    part[moving], masks[start + moving], moves[start + moving], scales[start + moving]
-                )
-            removing = remove[rows].nonzero()[:, 0]
-            if len(removing):
-                painted = background.paint(backgrounds[start + removing], height, width, noise)
-                part[removing] = torch.where(masks[start + removing], part[removing], to_float(painted))
-            result[rows] = part
+            moving = rows_where(moved[rows])
+            if isinstance(moving, slice):
+                geometry.warp(part, mask, boxes[rows], moves[rows], scales[rows])
+            elif moving is not None:
+                some, its = part[moving], mask[moving]
+                geometry.warp(some, its, boxes[rows][moving], moves[rows][moving], scales[rows][moving])
+                part[moving], mask[moving] = some, its
+            removing = rows_where(remove[rows])
+            if removing is not None:
+                painted = to_float(background.paint(backgrounds[rows][removing], height, width, noise))
+                part[removing] = torch.where(mask[removing], part[removing], painted)
         matrices = moves @ geometry.flips(flip, width)
     return result, masks, matrices
+
+
+def mirrored(images: Tensor, chosen: Tensor) -> Tensor:
+    """Images (n, C, H, W) with those mirrored that are `chosen` (n,); a copy where any is."""
+    rows = rows_where(chosen)
+    if rows is None:
+        return images
+    if isinstance(rows, slice):
+        return images.flip(-1)
+    images = images.clone()
+    images[rows] = images[rows].flip(-1)
+    return images
 
 
 def to_float(images: Tensor) -> Tensor:

@@ -128,7 +128,7 @@ def test_gradients_run_from_one_colour_to_the_other() -> None:
 
 
 def test_noise_is_the_difference_of_two_uniform_numbers_with_wrap_around() -> None:
-    field = noise_field(50, 100, 100, torch.Generator().manual_seed(0), torch.device("cpu"))
+    field = noise_field(50, 160, 160, torch.Generator().manual_seed(0), torch.device("cpu"))
     assert field.shape == (3, 200, 200)
     signed = field.flatten().to(torch.int8).long()  # 8-bit wrap-around: 255 is -1
     assert signed.min() == -49 and signed.max() == 49
@@ -164,7 +164,11 @@ def test_moves_follow_the_papers_ranges(size: int) -> None:
     masks = torch.zeros(1, 1, size, size, dtype=torch.bool)
     masks[..., size // 4 : size // 2, size // 4 : size * 3 // 4] = True
     matrices, moved, scales = draw_moves(
-        draws(GEOMETRY_COLUMNS), masks.expand(N, 1, size, size), torch.ones(N, dtype=torch.bool), CONFIG
+        draws(GEOMETRY_COLUMNS),
+        masks.expand(N, 1, size, size),
+        bounding_boxes(masks)[0].expand(N, 4),
+        torch.ones(N, dtype=torch.bool),
+        CONFIG,
     )
     assert moved.float().mean().item() == pytest.approx(0.5, abs=0.03)
     assert torch.equal(matrices[~moved], torch.eye(3).expand(int((~moved).sum()), 3, 3)) and (scales[~moved] == 1).all()
@@ -195,7 +199,11 @@ def test_objects_are_never_enlarged_beyond_the_limit() -> None:
     masks = torch.zeros(1, 1, 224, 224, dtype=torch.bool)
     masks[..., 100:110, 100:110] = True
     _, moved, scales = draw_moves(
-        draws(GEOMETRY_COLUMNS, 200), masks.expand(200, 1, 224, 224), torch.ones(200, dtype=torch.bool), CONFIG
+        draws(GEOMETRY_COLUMNS, 200),
+        masks.expand(200, 1, 224, 224),
+        bounding_boxes(masks)[0].expand(200, 4),
+        torch.ones(200, dtype=torch.bool),
+        CONFIG,
     )
     assert (scales[moved] == CONFIG.largest_scale).all()
 
@@ -205,7 +213,8 @@ def test_warp_by_whole_pixels_and_quarter_turns_is_exact() -> None:
     masks = torch.ones(2, 1, 8, 8, dtype=torch.bool)
     shift = torch.tensor([[1.0, 0, 2], [0, 1, -1], [0, 0, 1]])
     turn = torch.tensor([[0.0, -1, 8], [1, 0, 0], [0, 0, 1]])
-    new, alpha = warp(images, masks, torch.stack([shift, turn]), torch.ones(2))
+    new, alpha = images.clone(), masks.clone()
+    warp(new, alpha, bounding_boxes(masks)[0], torch.stack([shift, turn]), torch.ones(2))
     torch.testing.assert_close(new[0, :, :7, 2:], images[0, :, 1:, :6])
     assert not alpha[0, :, 7].any() and not alpha[0, :, :, :2].any() and alpha[0, :, :7, 2:].all()
     torch.testing.assert_close(new[1], images[1].transpose(1, 2).flip(2))
@@ -215,6 +224,7 @@ def test_small_objects_are_averaged_not_aliased() -> None:
     images = torch.rand(1, 3, 64, 64)
     masks = torch.ones(1, 1, 64, 64, dtype=torch.bool)
     quarter = torch.diag(torch.tensor([0.25, 0.25, 1.0]))[None]
-    new, alpha = warp(images, masks, quarter, torch.tensor([0.25]))
+    new, alpha = images.clone(), masks.clone()
+    warp(new, alpha, bounding_boxes(masks)[0], quarter, torch.tensor([0.25]))
     assert alpha.sum() == 16 * 16
     torch.testing.assert_close(new[:, :, :16, :16], F.avg_pool2d(images, 4))
