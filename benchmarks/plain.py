@@ -78,4 +78,4 @@ class PlainStep:
         with torch.no_grad():
             for own, new in zip(self.momentum.parameters(), self.network.parameters(), strict=True):
                 own.data = own.data * 0.999 + new.data * 0.001
-        return float(loss)
+        return loss.item()
