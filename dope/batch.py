@@ -52,6 +52,11 @@ class PairBatch:
     def pin_memory(self) -> PairBatch:
         return replace(self, **{n: getattr(self, n).pin_memory() for n in TENSORS})
 
+    def laid_out(self, *, channels_last: bool) -> PairBatch:
+        """The same batch with its images in one memory format: convolutions run in that of their input."""
+        layout = torch.channels_last if channels_last else torch.contiguous_format
+        return replace(self, **{n: getattr(self, n).contiguous(memory_format=layout) for n in ("images1", "images2")})
+
     def without_damaged(self) -> PairBatch:
         """The places that damaged samples left left out; maybe none remain."""
         whole = [place for place in range(len(self)) if place not in self.damaged]
@@ -60,17 +65,21 @@ class PairBatch:
 
     def swapped(self, swap: Tensor) -> PairBatch:
         """Exchange the two views of the pairs where `swap` (B,) bool is True."""
-        own = torch.arange(len(self), device=swap.device)
-        first, second = torch.where(swap, own + len(self), own), torch.where(swap, own, own + len(self))
-        images, masks = torch.cat([self.images1, self.images2]), torch.cat([self.masks1, self.masks2])
-        return replace(
-            self,
-            images1=images.index_select(0, first),
-            images2=images.index_select(0, second),
-            masks1=masks.index_select(0, first),
-            masks2=masks.index_select(0, second),
-            points=torch.where(swap[:, None, None], self.points[..., [2, 3, 0, 1]], self.points),
-        )
+        points = torch.where(swap[:, None, None], self.points[..., [2, 3, 0, 1]], self.points)
+        images1, images2 = _exchanged(self.images1, self.images2, swap)
+        masks1, masks2 = _exchanged(self.masks1, self.masks2, swap)
+        return replace(self, images1=images1, images2=images2, masks1=masks1, masks2=masks2, points=points)
+
+
+def _exchanged(first: Tensor, second: Tensor, swap: Tensor) -> tuple[Tensor, Tensor]:
+    """Both with the rows exchanged where `swap` (B,) is True."""
+    if not swap.is_cuda:  # rows are copied once, not twice
+        pairs = [(b, a) if s else (a, b) for a, b, s in zip(first, second, swap.tolist(), strict=True)]
+        a, b = zip(*pairs, strict=True)
+        return torch.stack(a), torch.stack(b)
+    own = torch.arange(len(swap), device=swap.device)
+    both, other = torch.cat([first, second]), own + len(swap)
+    return both.index_select(0, torch.where(swap, other, own)), both.index_select(0, torch.where(swap, own, other))
 
 
 TENSORS = ("images1", "images2", "masks1", "masks2", "points", "valid", "objects")

@@ -67,7 +67,8 @@ def sample_batch(batch: PairBatch, config: TrainConfig, step: int, share: Share 
     batch = batch.swapped(swap < 0.5)
     if config.pairs == "one_view_twice":
         batch = duplicate_view(batch)
-    return choose_cells(augment(batch, config.augmentation, generator, share), config.data.points, start)
+    views = augment(batch, config.augmentation, generator, share).laid_out(channels_last=config.channels_last)
+    return choose_cells(views, config.data.points, start)
 
 
 def choose_cells(views: PairBatch, points: int, start: Tensor | None = None) -> SampledBatch:

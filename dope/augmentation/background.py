@@ -21,7 +21,7 @@ class BackgroundPlan:
         first, second: (n, 3) colours in 0 to 255.
         horizontal: (n,) bool, whether the gradient runs along x.
         noisy: (n,) bool, whether there is noise.
-        corner: (n, 2) in [0, 1), where the view's window of the noise lies, down and to the right.
+        corner: (n, 2) in [0, 1), where the view's noise begins in the field, down and to the right.
     """
 
     first: Tensor
@@ -46,15 +46,21 @@ def draw_backgrounds(draws: Draws, config: AugmentationConfig) -> BackgroundPlan
 
 
 def noise_field(noise: int, height: int, width: int, generator: torch.Generator, device: torch.device) -> Tensor:
-    """Differences U{0..noise-1} - U{0..noise-1} of bytes with wrap-around, (3, H + H / 4, W + W / 4) uint8.
+    """Differences U{0..noise-1} - U{0..noise-1} of bytes with wrap-around, (3, H, W) uint8.
 
-    One field serves all views of a step, each by a window of its own: a pixel's noise has the same distribution as if
-    every view had its own field, for a fraction of the numbers, and all ranks can draw the same one.
+    One field serves all views of a step, each from a corner of its own on and round its edges: a pixel's noise has the
+    same distribution as if every view had its own field, for a fraction of the numbers, and all ranks can draw the
+    same one.
     """
     on_it = on_device(generator, device)
-    shape = (2, 3, height + height // 4, width + width // 4)
+    shape = (2, 3, height, width)
     plus, minus = torch.randint(noise, shape, dtype=torch.uint8, generator=on_it, device=device)
     return plus.sub_(minus)
+
+
+def corners(plan: BackgroundPlan, height: int, width: int) -> Tensor:
+    """Row and column (n, 2) of the field at which each view's noise begins."""
+    return (plan.corner * torch.tensor([height, width], device=plan.corner.device)).long()
 
 
 def paint(plan: BackgroundPlan, height: int, width: int, field: Tensor | None) -> Tensor:
@@ -71,8 +77,9 @@ def paint(plan: BackgroundPlan, height: int, width: int, field: Tensor | None) -
     rows = rows_where(plan.noisy)
     if field is None or rows is None:
         return painted
-    windows = field.unfold(1, height, 1).unfold(2, width, 1)  # (3, places down, places across, H, W), a view
-    top, left = (plan.corner[rows] * torch.tensor(windows.shape[1:3], device=device)).long().unbind(1)
+    # (3, places down, places across, H, W), a view
+    windows = field.repeat(1, 2, 2).unfold(1, height, 1).unfold(2, width, 1)
+    top, left = corners(plan, height, width)[rows].unbind(1)
     noise = windows[:, top, left].transpose(0, 1)
     if isinstance(rows, slice):
         return painted + noise

@@ -5,6 +5,7 @@ Matrices are 3x3, in pixels with centres at +0.5, and map points of the old view
 
 from __future__ import annotations
 
+import cv2
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -29,6 +30,9 @@ def flips(chosen: Tensor, width: int) -> Tensor:
 def bounding_boxes(masks: Tensor) -> tuple[Tensor, Tensor]:
     """Left, top, right, bottom edges (n, 4) float32 of masks (n, 1, H, W), and (n,) bool: whether any pixel is True."""
     numbers = masks[:, 0].view(torch.uint8)  # PyTorch takes `any` of bools one by one, but 16 bytes' largest at a time
+    if not masks.is_cuda:
+        boxes = torch.tensor([cv2.boundingRect(mask) for mask in numbers.numpy(force=True)]).view(-1, 4).float()
+        return torch.cat([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]], 1), boxes[:, 2] > 0
     columns, rows = numbers.amax(1), numbers.amax(2)
     edges = [
         columns.argmax(1),
@@ -77,69 +81,43 @@ def draw_moves(
     return torch.where(moved[:, None, None], matrices, identity), moved, torch.where(moved, scale, 1.0)
 
 
-def warp(images: Tensor, masks: Tensor, boxes: Tensor, matrices: Tensor, scales: Tensor) -> None:
-    """Move objects by `matrices` within images (n, 3, H, W) and masks (n, 1, H, W), in place.
+def warp(images: Tensor, masks: Tensor, matrices: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
+    """Move objects by `matrices` within images (n, 3, H, W) and masks (n, 1, H, W); what the new ones are.
 
     Colours are weighted by the mask, so that the old background does not bleed into the object's rim; what they are
     where the new mask is False is left open. Objects that shrink to less than a half are averaged down before, against
     aliasing.
 
     Args:
-        boxes: (n, 4) edges of the objects' boxes, outside of which no mask pixel is True.
         matrices: (n, 3, 3), from the old view to the new.
         scales: (n,) of the matrices.
     """
-    (top, left, height, width), (to_top, to_left, to_height, to_width) = _windows(images, boxes, matrices)
-    here = (..., slice(top, top + height), slice(left, left + width))
-    there = (..., slice(to_top, to_top + to_height), slice(to_left, to_left + to_width))
-    alpha = masks[here].to(images.dtype)
-    layers = torch.cat([images[here] * alpha, alpha], 1)
-    usable = [level for level in LEVELS if height % 2**level == 0 and width % 2**level == 0]
-    levels = (-scales.log2()).floor().clamp(0, usable[-1])
-    # pixels of the new view to places in the window of the old one, both edges of which are at -1 and 1
+    height, width = images.shape[-2:]
+    alpha = masks.to(images.dtype)
+    layers = torch.cat([images * alpha, alpha], 1)
+    levels = halvings(scales, height, width)
+    # pixels of the new view to places in the old one, both edges of which are at -1 and 1
     back = torch.linalg.inv_ex(matrices).inverse
-    x = torch.arange(to_left, to_left + to_width, device=images.device) + 0.5
-    y = (torch.arange(to_top, to_top + to_height, device=images.device) + 0.5)[:, None]
-    grid = torch.empty(len(images), to_height, to_width, 2, device=images.device)
-    for axis, (start, size) in enumerate(((left, width), (top, height))):
+    x = torch.arange(width, device=images.device) + 0.5
+    y = (torch.arange(height, device=images.device) + 0.5)[:, None]
+    grid = torch.empty(len(images), height, width, 2, device=images.device)
+    for axis, size in enumerate((width, height)):
         a, b, c = (back[:, axis] * (2 / size))[:, :, None, None].unbind(1)
-        torch.add(a * x, b * y + (c - (2 * start / size + 1)), out=grid[..., axis])
-    moved = torch.empty(len(images), 4, to_height, to_width, device=images.device)
-    for level in usable:
+        torch.add(a * x, b * y + (c - 1), out=grid[..., axis])
+    moved = torch.empty_like(layers)
+    for level in LEVELS:
         rows = rows_where(levels == level)
         if rows is not None:
             source = F.avg_pool2d(layers[rows], 2**level) if level else layers[rows]
             moved[rows] = F.grid_sample(source, grid[rows], mode="bilinear", padding_mode="zeros", align_corners=False)
     new_alpha = moved[:, 3:]
-    torch.div(moved[:, :3], new_alpha.clamp(min=1e-6), out=images[there]).clamp_(0, 1)
-    masks.zero_()
-    torch.gt(new_alpha, 0.5, out=masks[there])
+    return (moved[:, :3] / new_alpha.clamp(min=1e-6)).clamp_(0, 1), new_alpha > 0.5
 
 
-Window = tuple[int, int, int, int]  # top, left, height, width
-
-
-def _windows(images: Tensor, boxes: Tensor, matrices: Tensor) -> tuple[Window, Window]:
-    """What the objects of all views fill before and after a move: on CPUs, where asking for it costs nothing."""
-    height, width = images.shape[-2:]
-    whole = (0, 0, height, width)
-    if images.is_cuda:
-        return whole, whole
-    corners = boxes[:, [0, 1, 2, 1, 0, 3, 2, 3]].view(-1, 4, 2)
-    edges = [
-        f(c.flatten(0, 1), 0) for c in (corners, transform_points(corners, matrices)) for f in (torch.amin, torch.amax)
-    ]
-    low, high, to_low, to_high = torch.stack(edges).tolist()
-    coarse = 2 ** LEVELS[-1]  # pixels of the coarsest level begin where they would without a window
-    around = coarse if height % coarse == 0 and width % coarse == 0 else height * width
-    return _window(low, high, around, height, width), _window(to_low, to_high, 1, height, width)
-
-
-def _window(low: list[float], high: list[float], grain: int, height: int, width: int) -> Window:
-    """The window around a box and two pixels more, its edges multiples of `grain`, within the view."""
-    first = [max(0, int((edge - 2) // grain) * grain) for edge in low]
-    last = [min(size, int(-((-edge - 2) // grain)) * grain) for edge, size in zip(high, (width, height), strict=True)]
-    return first[1], first[0], last[1] - first[1], last[0] - first[0]
+def halvings(scales: Tensor, height: int, width: int) -> Tensor:
+    """How often (n,) each view is halved before it is resampled by `scales` (n,): as often as its sides allow."""
+    usable = [level for level in LEVELS if height % 2**level == 0 and width % 2**level == 0]
+    return (-scales.log2()).floor().clamp(0, usable[-1]).long()
 
 
 def transform_points(points: Tensor, matrices: Tensor) -> Tensor:

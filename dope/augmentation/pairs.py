@@ -36,7 +36,7 @@ def augment(
     option = (uniform[:, 0] * 4).long()
     remove = torch.cat([option != 1, option != 0]) & (config.background_removal == "paired")
     images, masks, matrices = augment_views(
-        torch.cat([batch.images1, batch.images2]),
+        [batch.images1, batch.images2],
         torch.cat([batch.masks1, batch.masks2]),
         remove,
         config,

@@ -2,15 +2,40 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
-from dope.augmentation import background, colour, geometry
+from dope.augmentation import background, colour, geometry, on_cpu
 from dope.augmentation.config import AugmentationConfig
 from dope.augmentation.draws import WHOLE, Draws, rows_where, uniform_rows
 
-PIXELS_AT_ONCE = 1 << 16  # on CPUs: so few views at a time stay in the cache between operations, one of 224 px
 COLUMNS = 1 + colour.COLUMNS + geometry.COLUMNS + background.COLUMNS
+
+
+@dataclass(frozen=True)
+class ViewPlan:
+    """What is to be done to each of n views.
+
+    Attributes:
+        flip: (n,) bool, mirrored first.
+        colours: changes of the whole view's colours.
+        remove: (n,) bool, whether the background is replaced by `backgrounds`, with windows of the field `noise`.
+        boxes: (n, 4) left, top, right and bottom edges of the mirrored objects.
+        moved: (n,) bool, whether the mirrored object is moved by `moves` (n, 3, 3) with `scales` (n,).
+    """
+
+    flip: Tensor
+    colours: colour.ColourPlan
+    remove: Tensor
+    backgrounds: background.BackgroundPlan
+    noise: Tensor | None
+    boxes: Tensor
+    moved: Tensor
+    moves: Tensor
+    scales: Tensor
 
 
 @torch.no_grad()
@@ -30,13 +55,13 @@ def augment_images(
     """
     draws = Draws(uniform_rows(len(images), 1 + COLUMNS, generator, images.device, WHOLE))
     remove = draws.chance(config.single_background_p) & (config.background_removal != "off")
-    new_images, new_masks, _ = augment_views(images, masks, remove, config, draws, generator)
+    new_images, new_masks, _ = augment_views([images], masks, remove, config, draws, generator)
     return new_images, new_masks
 
 
 @torch.no_grad()
 def augment_views(
-    images: Tensor,
+    images: Sequence[Tensor],
     masks: Tensor,
     remove: Tensor,
     config: AugmentationConfig,
@@ -46,6 +71,8 @@ def augment_views(
     """Change colours, flip, and where `remove` (n,): move the object and paint a new background.
 
     Args:
+        images: (b, 3, H, W) each, of n views in all.
+        masks: (n, 1, H, W) bool.
         draws: holds `COLUMNS` numbers a view; all that is drawn for a view comes from them.
         generator: of the noise that all views share.
 
@@ -53,40 +80,48 @@ def augment_views(
         images (n, 3, H, W) float32, masks (n, 1, H, W) bool, and the matrices (n, 3, 3) that map points of the old
         views to the new ones.
     """
-    n, _, height, width = images.shape
+    height, width = masks.shape[-2:]
     flip = draws.chance(config.flip_p)
     colours = colour.draw_colour(draws, config)
     backgrounds = background.draw_backgrounds(draws, config)
     noise = None
     if config.noise > 0 and config.noise_p > 0 and config.background_removal != "off":
-        noise = background.noise_field(config.noise, height, width, generator, images.device)
+        noise = background.noise_field(config.noise, height, width, generator, masks.device)
 
     masks = mirrored(masks, flip)
     boxes, present = geometry.bounding_boxes(masks)
     remove = remove & present
     moves, moved, scales = geometry.draw_moves(draws, masks, boxes, remove & config.geometry, config)
+    plan = ViewPlan(flip, colours, remove, backgrounds, noise, boxes, moved, moves, scales)
+    make = on_cpu.change_views if masks.device.type == "cpu" else change_views
+    with torch.autocast(masks.device.type, enabled=False):
+        new_images, new_masks = make(images, masks, plan)
+        return new_images, new_masks, moves @ geometry.flips(flip, width)
 
-    result = torch.empty(images.shape, dtype=torch.float32, device=images.device)
-    at_once = n if images.is_cuda else max(1, PIXELS_AT_ONCE // (height * width))
-    with torch.autocast(images.device.type, enabled=False):
-        for start in range(0, n, at_once):
-            rows = slice(start, start + at_once)
-            part, mask = result[rows], masks[rows]
-            part.copy_(to_float(mirrored(images[rows], flip[rows])))
-            colour.change_colours(part, colours[rows])
-            moving = rows_where(moved[rows])
-            if isinstance(moving, slice):
-                geometry.warp(part, mask, boxes[rows], moves[rows], scales[rows])
-            elif moving is not None:
-                some, its = part[moving], mask[moving]
-                geometry.warp(some, its, boxes[rows][moving], moves[rows][moving], scales[rows][moving])
-                part[moving], mask[moving] = some, its
-            removing = rows_where(remove[rows])
-            if removing is not None:
-                painted = to_float(background.paint(backgrounds[rows][removing], height, width, noise))
-                part[removing] = torch.where(mask[removing], part[removing], painted)
-        matrices = moves @ geometry.flips(flip, width)
-    return result, masks, matrices
+
+def change_views(images: Sequence[Tensor], masks: Tensor, plan: ViewPlan) -> tuple[Tensor, Tensor]:
+    """Carry out a plan on all views at a time, as a GPU has it best.
+
+    Args:
+        images: (b, 3, H, W) of n views in all, not yet mirrored.
+        masks: (n, 1, H, W) bool, mirrored already.
+
+    Returns:
+        images (n, 3, H, W) float32 and masks (n, 1, H, W) bool.
+    """
+    height, width = masks.shape[-2:]
+    result, masks = to_float(mirrored(torch.cat(tuple(images)), plan.flip)), masks.clone()
+    colour.change_colours(result, plan.colours)
+    moving = rows_where(plan.moved)
+    if moving is not None:
+        result[moving], masks[moving] = geometry.warp(
+            result[moving], masks[moving], plan.moves[moving], plan.scales[moving]
+        )
+    removing = rows_where(plan.remove)
+    if removing is not None:
+        painted = to_float(background.paint(plan.backgrounds[removing], height, width, plan.noise))
+        result[removing] = torch.where(masks[removing], result[removing], painted)
+    return result, masks
 
 
 def mirrored(images: Tensor, chosen: Tensor) -> Tensor:

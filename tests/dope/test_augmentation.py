@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import pytest
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from dope.augmentation import AugmentationConfig, augment, augment_images, duplicate_view, no_augmentation, views
+from dope.augmentation import (
+    AugmentationConfig,
+    Share,
+    augment,
+    augment_images,
+    duplicate_view,
+    no_augmentation,
+    on_cpu,
+    views,
+)
+from dope.augmentation.colour import ColourPlan, change_colours
 from dope.augmentation.geometry import bounding_boxes
-from dope.batch import PairBatch
+from dope.batch import TENSORS, PairBatch
 
 PLAIN = AugmentationConfig(colour_p=0.0, flip_p=0.0, background_removal="off", geometry=False)
 OBJECT, GROUND = 200, 10  # grey values; no background is compared with them where noise could hit them
@@ -189,13 +201,56 @@ def test_float_images_give_what_bytes_give() -> None:
     torch.testing.assert_close(first.images1, second.images1)
 
 
-def test_number_of_views_at_once_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    batch, config = make_batch(9), AugmentationConfig()
+SMALL = (10, 30)  # objects that are averaged down once and twice before they are resampled
+
+
+@pytest.mark.parametrize(("height", "width"), [(64, 64), (48, 80), (50, 71)])
+@pytest.mark.parametrize("longest_side_px", [(56, 195), SMALL])
+def test_view_by_view_gives_what_all_at_a_time_give(
+    height: int, width: int, longest_side_px: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    batch = make_batch(48, height, width)
+    noise = torch.rand(2, 48, 3, height // 8, width // 8, generator=seeded(2))
+    smooth = (255 * F.interpolate(noise.flatten(0, 1), (height, width), mode="bicubic").clamp(0, 1)).to(torch.uint8)
+    batch = replace(batch, images1=smooth[:48], images2=smooth[48:])
+    config = AugmentationConfig(longest_side_px=longest_side_px)
+    for given in (batch, no_augmentation(batch)):
+        with monkeypatch.context() as patch:
+            single = augment(given, config, seeded())
+            patch.setattr(on_cpu, "change_views", views.change_views)
+            whole = augment(given, config, seeded())
+        for name in ("images1", "images2"):  # OpenCV before version 5 rounds places to 1/32 px
+            torch.testing.assert_close(getattr(single, name), getattr(whole, name), atol=0.02, rtol=0)
+        for name in ("masks1", "masks2"):
+            assert (getattr(single, name) != getattr(whole, name)).float().mean() < 1e-3
+        assert torch.equal(single.points, whole.points)
+
+
+@pytest.mark.parametrize("chosen", list(itertools.product([False, True], repeat=5)))
+@pytest.mark.parametrize("amount", [(0.3, 0.4, 0.7, 0.6, 0.6), (-0.4, 1.9, 1.5, 1.4, 1.5)])
+def test_colours_view_by_view_are_those_of_the_batch(chosen: tuple[bool, ...], amount: tuple[float, ...]) -> None:
+    image = torch.randint(256, (1, 3, 9, 12), generator=seeded(), dtype=torch.uint8)
+    image[..., 0, :4] = torch.tensor([0, 255, 77, 0], dtype=torch.uint8)  # black, white, grey
+    expected = views.to_float(image)
+    change_colours(expected, ColourPlan(torch.tensor(chosen)[:, None], torch.tensor(amount)[:, None]))
+    window = (slice(2, 7), slice(3, 11))
+    for pixels in (image, views.to_float(image)):
+        interleaved = pixels[0].permute(1, 2, 0).numpy().copy()
+        whole = on_cpu.coloured(interleaved, chosen, amount)
+        part = on_cpu.coloured(interleaved, chosen, amount, window)
+        torch.testing.assert_close(torch.from_numpy(whole).permute(2, 0, 1), expected[0], atol=1e-4, rtol=0)
+        torch.testing.assert_close(torch.from_numpy(part), torch.from_numpy(whole[window]), atol=1e-6, rtol=0)
+
+
+def test_views_beside_it_change_nothing_of_a_view() -> None:
+    batch, config = make_batch(9), AugmentationConfig(noise_p=0.0)
     whole = augment(batch, config, seeded())
-    monkeypatch.setattr(views, "PIXELS_AT_ONCE", 1)
-    single = augment(batch, config, seeded())
-    torch.testing.assert_close(whole.images2, single.images2)
-    assert torch.equal(whole.masks2, single.masks2) and torch.equal(whole.points, single.points)
+    alone = [
+        augment(replace(batch, **{n: getattr(batch, n)[i : i + 1] for n in TENSORS}), config, seeded(), Share(i, 9))
+        for i in range(9)
+    ]
+    assert torch.equal(torch.cat([part.images2 for part in alone]), whole.images2)
+    assert torch.equal(torch.cat([part.masks2 for part in alone]), whole.masks2)
 
 
 def test_single_views_lose_half_of_their_backgrounds() -> None:

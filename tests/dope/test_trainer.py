@@ -238,6 +238,15 @@ def test_either_view_may_be_the_first(shards: Path) -> None:
     assert 4 <= sum(same) <= 16
 
 
+@pytest.mark.parametrize(("channels_last", "layout"), [(True, torch.channels_last), (False, torch.contiguous_format)])
+def test_images_lie_in_memory_as_the_setting_says(
+    shards: Path, channels_last: bool, layout: torch.memory_format
+) -> None:
+    config = tiny(f"channels_last={channels_last}")
+    views = sample_batch(batch_of(shards, config), config, 0).views
+    assert views.images1.is_contiguous(memory_format=layout) and views.images2.is_contiguous(memory_format=layout)
+
+
 @pytest.mark.parametrize("pairs", ["two_views", "one_view_twice"])
 def test_random_numbers_are_a_function_of_seed_step_and_place_in_the_global_batch(shards: Path, pairs: str) -> None:
     config = tiny(f"pairs={pairs}", "augmentation.geometry_p=1", "augmentation.noise_p=1")
