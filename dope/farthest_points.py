@@ -34,13 +34,22 @@ def farthest_points(points: Tensor, valid: Tensor, n: int, start: Tensor | None 
     x, y = points.float().masked_fill(~valid[..., None], 0.0).unbind(-1)
     x, y = x.contiguous(), y.contiguous()
     distance = torch.where(valid, torch.inf, TAKEN)
+    dx, dy = torch.empty_like(x), torch.empty_like(y)
     before = torch.zeros_like(count) if start is None else (start * count).long().clamp(max=points.shape[1] - 1)
     chosen = ((valid.cumsum(1) == before[:, None] + 1) & valid).to(torch.uint8).argmax(1, keepdim=True)
     for i in range(n):
         if i > 0:
-            chosen = distance.argmax(1, keepdim=True)
+            chosen = _argmax(distance)
         index[:, i : i + 1] = chosen
-        dx, dy = x - x.gather(1, chosen), y - y.gather(1, chosen)
-        distance = torch.minimum(distance, dx.mul_(dx).add_(dy.mul_(dy)), out=distance)
+        torch.sub(x, x.gather(1, chosen), out=dx)
+        torch.sub(y, y.gather(1, chosen), out=dy)
+        torch.minimum(distance, dx.mul_(dx).addcmul_(dy, dy), out=distance)
         distance.scatter_(1, chosen, TAKEN)
     return torch.where(ok, index, index[:, :1]), ok
+
+
+def _argmax(rows: Tensor) -> Tensor:
+    """(B, N) to the first place (B, 1) of each row's largest number."""
+    if rows.is_cuda:
+        return rows.argmax(1, keepdim=True)
+    return torch.from_numpy(rows.numpy().argmax(1)[:, None])  # compares many at a time, which PyTorch does not
