@@ -17,10 +17,11 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import Any
 
 from dope.common.errors import BadInput, DopeError
@@ -75,57 +76,114 @@ def stop_children() -> None:
 
 
 def run_in_child(work: Callable[..., Any], *args: Any, limits: Limits, notify: Notify | None = None) -> Any:
-    """Call `work(*args, notify)` in a fresh process and return its result.
+    """Call `work(*args, notify)` in a fresh process and return its result; see `Child.call`."""
+    child = Child(limits)
+    try:
+        return child.call(work, *args, notify=notify)
+    finally:
+        child.close()
+
+
+class Child:
+    """A process that does one piece of work after the other, for work that is short beside the start of a process.
 
     Args:
-        work: a function importable by name; its last argument is `notify(text)`.
-        limits: wall-clock minutes, memory and threads.
-        notify: called in this process with what the child reports.
-
-    Raises:
-        ChildFailed: the child was killed, crashed, ran out of time or memory; the message says which.
-        ChildStopped: `stop_children` was called.
-        Exception: whatever `work` raised.
+        limits: wall-clock minutes of each piece; memory and threads of the process.
     """
-    context = multiprocessing.get_context("spawn")
-    receiver, sender = context.Pipe(duplex=False)
-    with tempfile.NamedTemporaryFile(prefix="dope-child-", suffix=".log") as log:
-        child = context.Process(target=_child_main, args=(sender, log.name, limits, work, args), daemon=False)
+
+    def __init__(self, limits: Limits) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._limits = limits
+        self._log = tempfile.NamedTemporaryFile(prefix="dope-child-", suffix=".log")  # noqa: SIM115
+        self._pipe, other = context.Pipe()
+        self._process = context.Process(target=_child_main, args=(other, self._log.name, limits), daemon=False)
+        self.calls = 0
+        """How many pieces of work it was given."""
         with _thread_counts_in_environment(limits.threads):
-            child.start()
-        sender.close()
+            self._process.start()
+        other.close()
+
+    def call(self, work: Callable[..., Any], *args: Any, notify: Notify | None = None) -> Any:
+        """Call `work(*args, notify)` there and return its result.
+
+        Args:
+            work: a function importable by name; its last argument is `notify(text)`.
+            notify: called in this process with what the child reports.
+
+        Raises:
+            ChildFailed: the child was killed, crashed, ran out of time or memory; the message says which. It is of no
+                more use.
+            ChildStopped: `stop_children` was called. The same.
+            Exception: whatever `work` raised.
+        """
+        self.calls += 1
+        self._log.truncate(0)
+        deadline = time.monotonic() + self._limits.minutes * 60
+        with suppress(OSError):  # it has died since: what it said last is told below
+            self._pipe.send((work, args))
+        while True:
+            ready = wait([self._pipe, _stop_sign.fileno()], timeout=max(0.0, deadline - time.monotonic()))
+            if _stop_sign.is_shown:
+                raise ChildStopped("was stopped before it was done", remedy="Run the same command again to go on")
+            if self._pipe not in ready:
+                raise ChildFailed(
+                    f"took longer than {self._limits.minutes:g} minutes and was stopped",
+                    remedy="Raise --minutes and add --retry-failed, or use fewer or smaller frames (--count, "
+                    "--long-side)",
+                )
+            try:
+                kind, value = self._pipe.recv()
+            except (EOFError, OSError):  # OSError: it was killed in the midst of a message
+                self._process.join()
+                raise ChildFailed(_cause_of_death(self._process.exitcode, self._limits, Path(self._log.name))) from None
+            if kind == "note":
+                if notify:
+                    notify(value)
+            elif kind == "error":
+                raise value
+            else:
+                return value
+
+    def close(self) -> None:
+        """End the process, whatever it does."""
+        if self._process.is_alive():
+            self._process.kill()
+        self._process.join()
+        self._pipe.close()
+        self._log.close()
+
+
+class Children:
+    """As many child processes as there are callers at a time, each ended after `reuse` pieces of work or a failure."""
+
+    def __init__(self, limits: Limits, *, reuse: int) -> None:
+        self._limits, self._reuse = limits, reuse
+        self._idle: SimpleQueue[Child] = SimpleQueue()
+
+    def __enter__(self) -> Children:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        while not self._idle.empty():
+            self._idle.get().close()
+
+    def call(self, work: Callable[..., Any], *args: Any, notify: Notify | None = None) -> Any:
+        """`Child.call` in one of them."""
         try:
-            return _listen(receiver, child, limits, notify, Path(log.name))
+            child = self._idle.get_nowait()
+        except Empty:
+            child = Child(self._limits)
+        usable = True
+        try:
+            return child.call(work, *args, notify=notify)
+        except (ChildFailed, KeyboardInterrupt):
+            usable = False
+            raise
         finally:
-            if child.is_alive():
-                child.kill()
-            child.join()
-            receiver.close()
-
-
-def _listen(receiver: Connection, child: Any, limits: Limits, notify: Notify | None, log: Path) -> Any:
-    deadline = time.monotonic() + limits.minutes * 60
-    while True:
-        ready = wait([receiver, _stop_sign.fileno()], timeout=max(0.0, deadline - time.monotonic()))
-        if _stop_sign.is_shown:
-            raise ChildStopped("was stopped before it was done", remedy="Run the same command again to go on")
-        if receiver not in ready:
-            raise ChildFailed(
-                f"took longer than {limits.minutes:g} minutes and was stopped",
-                remedy="Raise --minutes and add --retry-failed, or use fewer or smaller frames (--count, --long-side)",
-            )
-        try:
-            kind, value = receiver.recv()
-        except (EOFError, OSError):  # OSError: it was killed in the midst of a message
-            child.join()
-            raise ChildFailed(_cause_of_death(child.exitcode, limits, log)) from None
-        if kind == "note":
-            if notify:
-                notify(value)
-        elif kind == "error":
-            raise value
-        else:
-            return value
+            if usable and child.calls < self._reuse:
+                self._idle.put(child)
+            else:
+                child.close()
 
 
 def _cause_of_death(exitcode: int | None, limits: Limits, log: Path) -> str:
@@ -160,7 +218,7 @@ def _thread_counts_in_environment(threads: int) -> Iterator[None]:
                     os.environ[name] = value
 
 
-def _child_main(sender: Connection, log: str, limits: Limits, work: Callable[..., Any], args: tuple[Any, ...]) -> None:
+def _child_main(pipe: Connection, log: str, limits: Limits) -> None:
     file = os.open(log, os.O_WRONLY | os.O_APPEND)
     for stream in (1, 2):  # native code writes here; the parent's terminal belongs to the progress display
         os.dup2(file, stream)
@@ -168,16 +226,23 @@ def _child_main(sender: Connection, log: str, limits: Limits, work: Callable[...
     _die_with_parent()
     limit = int(limits.memory_gib * 2**30)
     resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
-    try:
-        import cv2
+    while True:
+        try:
+            work, args = pipe.recv()
+        except EOFError:
+            break
+        except BaseException as error:  # its modules cannot be loaded
+            pipe.send(("error", _portable(error, limits)))
+            continue
+        try:
+            import cv2
 
-        cv2.setNumThreads(limits.threads)
-        result: tuple[str, Any] = ("result", work(*args, lambda text: sender.send(("note", text))))
-    except BaseException as error:
-        result = ("error", _portable(error, limits))
-    sender.send(result)
-    sender.close()
-    sys.stdout.flush()
+            cv2.setNumThreads(limits.threads)
+            result: tuple[str, Any] = ("result", work(*args, lambda text: pipe.send(("note", text))))
+        except BaseException as error:
+            result = ("error", _portable(error, limits))
+        sys.stdout.flush()
+        pipe.send(result)
     os._exit(0)  # native libraries' exit handlers have crashed after good work
 
 

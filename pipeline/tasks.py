@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
 from dope.common.errors import DiskFull, DopeError
 from pipeline import stages
-from pipeline.children import ChildFailed, ChildStopped, Limits, run_in_child
+from pipeline.children import ChildFailed, Children, ChildStopped, Limits, run_in_child
 from pipeline.engines import holding, run_items
 from pipeline.refused import refused
 from pipeline.sequence import Sequence
@@ -64,18 +65,26 @@ class Task:
     """Why nothing may be run."""
 
 
-def run_tasks(tasks: list[Task], options: RunOptions, watcher: Watcher) -> list[StageResult]:
+def run_tasks(tasks: list[Task], options: RunOptions, watcher: Watcher, *, reuse: int = 1) -> list[StageResult]:
+    """Do what is not done of every task; rows in the order of the tasks.
+
+    Args:
+        reuse: how many tasks a child process does one after the other; 1: each has its own.
+    """
+
     def one(task: Task) -> list[StageResult]:
         rows = already_done(task, options)
         if rows is None and task.refusal is not None:
             rows = [refused(task.folder.name, task.stages[0], task.refusal)]
         if rows is None:
             watcher.started(task.folder.name)
-            rows = _in_child(task, options, watcher)
+            rows = _in_child(task, options, watcher, call)
         watcher.finished(task.folder.name, rows)
         return rows
 
-    results = run_items(tasks, one, workers=options.workers)
+    with Children(options.limits, reuse=reuse) as children:
+        call = children.call if reuse > 1 else partial(run_in_child, limits=options.limits)
+        results = run_items(tasks, one, workers=options.workers)
     return [row for rows in results for row in rows]
 
 
@@ -95,7 +104,9 @@ def already_done(task: Task, options: RunOptions) -> list[StageResult] | None:
     return rows
 
 
-def _in_child(task: Task, options: RunOptions, watcher: Watcher) -> list[StageResult]:
+def _in_child(
+    task: Task, options: RunOptions, watcher: Watcher, call: Callable[..., list[StageResult]]
+) -> list[StageResult]:
     started: list[str] = []
 
     def note(text: str) -> None:
@@ -107,9 +118,7 @@ def _in_child(task: Task, options: RunOptions, watcher: Watcher) -> list[StageRe
     try:
         with holding(task.folder):
             try:
-                rows: list[StageResult] = run_in_child(
-                    task.run, task.folder, *task.arguments, options, limits=options.limits, notify=note
-                )
+                rows = call(task.run, task.folder, *task.arguments, options, notify=note)
             except ChildStopped:
                 raise
             except ChildFailed as error:  # the child could not write its own marker

@@ -12,7 +12,7 @@ import pytest
 
 from dope.common.errors import BadInput
 from pipeline import children
-from pipeline.children import ChildFailed, ChildStopped, Limits, run_in_child
+from pipeline.children import ChildFailed, Children, ChildStopped, Limits, run_in_child
 from pipeline.sequence import Sequence
 from pipeline.stages import read_marker, run_stage
 
@@ -113,3 +113,33 @@ def test_errors_of_the_work_come_back_as_they_are() -> None:
         run_in_child(refuse, limits=Limits())
     with pytest.raises(RuntimeError, match="odd 1 2"):
         run_in_child(odd, limits=Limits())
+
+
+def my_number(notify) -> int:
+    return os.getpid()
+
+
+def test_children_are_used_again_and_replaced_when_they_fail_or_have_done_their_share() -> None:
+    with Children(Limits(), reuse=3) as pool:
+        first = [pool.call(my_number) for _ in range(3)]
+        assert len(set(first)) == 1 and pool.call(my_number) != first[0]
+        second = pool.call(my_number)
+        with pytest.raises(BadInput, match="is not a video"):
+            pool.call(refuse)  # an answer like any other: the process is well
+        third = pool.call(my_number)
+        assert third != second  # it was its third piece of work
+        with pytest.raises(ChildFailed, match=r"SIGABRT.*out of luck"):
+            pool.call(crash)
+        assert pool.call(my_number) not in (first[0], second, third)
+
+
+def test_what_an_earlier_item_said_is_not_told_of_a_later_one() -> None:
+    with Children(Limits(), reuse=9) as pool:
+        pool.call(say)
+        with pytest.raises(ChildFailed) as failed:
+            pool.call(leave)
+    assert "hello" not in str(failed.value)
+
+
+def say(notify) -> None:
+    os.write(1, b"hello\n")

@@ -1,0 +1,1 @@
+"""Meshes to prepared sequences: pictures with exact masks, depth and cameras (the paper's renders, supplement)."""
