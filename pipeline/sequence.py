@@ -141,6 +141,8 @@ class SequenceInfo:
     """Length, in this sequence's unit, of one unit of the cameras as given or reconstructed; None: no cameras."""
     ordered: bool = False
     """True where neighbouring frames are neighbouring views (videos, turntables)."""
+    paired: bool = False
+    """True where frames 2k and 2k + 1 were made to be a pair (renders)."""
     n_frames: int = 0
     n_registered: int = 0
     registered_share: float = 0.0

@@ -9,6 +9,7 @@ from pipeline.commands.colmap import colmap
 from pipeline.commands.correspond import correspond
 from pipeline.commands.export import export
 from pipeline.commands.masks import masks
+from pipeline.commands.render import render
 from pipeline.commands.report import report
 from pipeline.commands.run import run
 from pipeline.commands.shards import shards
@@ -17,7 +18,7 @@ from pipeline.commands.status import status
 app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode="rich",
-    help="""Turn videos and photo folders into shards of pixel correspondences.
+    help="""Turn videos, photo folders and meshes into shards of pixel correspondences.
 
     [bold]dope prep run INPUT... --out WORK --shards SHARDS[/] does everything. The stages of their own, in order;
     each does only what is missing, and may be run again at any time:
@@ -25,6 +26,8 @@ app = typer.Typer(
       1. [bold]dope prep colmap[/]      frames, cameras (COLMAP) and depth maps of each video or photo folder
 
          [bold]dope prep co3d[/]        the same of a CO3D download, with its own cameras, masks and depth
+
+         [bold]dope prep render[/]      the same of meshes: pictures rendered with exact masks, depth and cameras
 
       2. [bold]dope prep masks[/]       the object's mask in every frame: yours, or cut out by GrabCut
 
@@ -44,6 +47,7 @@ app = typer.Typer(
 app.command("run")(run)
 app.command("colmap")(colmap)
 app.command("co3d")(co3d)
+app.command("render")(render)
 app.command("masks")(masks)
 app.command("correspond")(correspond)
 app.command("shards")(shards)

@@ -21,7 +21,7 @@ from dope.common import files, seeds, settings
 from pipeline.correspond.depth_sampling import DepthSampler
 from pipeline.correspond.farthest_points import farthest_points
 from pipeline.correspond.outline import outline_details
-from pipeline.correspond.pairs import PairsConfig, candidate_pairs, select_pairs, view_angles_deg
+from pipeline.correspond.pairs import PairsConfig, candidate_pairs, made_pairs, select_pairs, view_angles_deg
 from pipeline.correspond.views import VIEW_SCHEMA, View, ViewsConfig, build_views, views_table, write_view
 from pipeline.geometry import Camera, relative_pose
 from pipeline.sequence import Sequence
@@ -204,7 +204,8 @@ def correspond(sequence: Sequence, config: CorrespondConfig) -> dict[str, Any]:
     with files.atomic_path(views_table(sequence)) as partial:
         pq.write_table(views_rows, partial)
     details: dict[str, Any] = {"views": len(rows), "views_with_depth": len(surfaces), "frames_skipped": dict(skipped)}
-    table, pair_details = match_pairs(surfaces, config)
+    in_pairs = config.pairs.choose == "made" or (config.pairs.choose == "auto" and sequence.read_info().paired)
+    table, pair_details = match_pairs(surfaces, config, made=in_pairs)
     with files.atomic_path(sequence.correspondences) as partial:
         rows_table = pa.Table.from_pylist(table, PAIR_SCHEMA)
         pq.write_table(rows_table, partial, row_group_size=ROW_GROUP, use_dictionary=False)  # coordinates do not repeat
@@ -224,8 +225,14 @@ def _content_of(sequence: Sequence) -> str:
     return digest.hexdigest()[:32]
 
 
-def match_pairs(surfaces: list[Surface], config: CorrespondConfig) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Choose and match the pairs: rows of correspondences.parquet in order of frames, and what to say of them."""
+def match_pairs(
+    surfaces: list[Surface], config: CorrespondConfig, *, made: bool = False
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Choose and match the pairs: rows of correspondences.parquet in order of frames, and what to say of them.
+
+    Args:
+        made: the views were made in pairs, and are paired so.
+    """
     if len(surfaces) < 2:
         return [], {"candidate_pairs": 0, "pairs": 0, "pairs_dropped": {}}
     cameras = [surface.camera for surface in surfaces]
@@ -238,7 +245,10 @@ def match_pairs(surfaces: list[Surface], config: CorrespondConfig) -> tuple[list
         dropped["overlap too small"] += share < config.pairs.min_overlap
         return share
 
-    chosen = select_pairs(cameras, target, overlap, config.pairs)
+    if made:
+        chosen = made_pairs([surface.frame for surface in surfaces], overlap, config.pairs)
+    else:
+        chosen = select_pairs(cameras, target, overlap, config.pairs)
     rows = []
     for i, j in chosen:
         found = match(surfaces[i], surfaces[j], config.match)
@@ -258,7 +268,7 @@ def match_pairs(surfaces: list[Surface], config: CorrespondConfig) -> tuple[list
         )
     rows.sort(key=lambda row: (row["frame1"], row["frame2"]))
     details: dict[str, Any] = {
-        "candidate_pairs": len(candidate_pairs(angles, config.pairs)),
+        "candidate_pairs": len(surfaces) // 2 if made else len(candidate_pairs(angles, config.pairs)),
         "pairs": len(rows),
         "pairs_dropped": {reason: n for reason, n in dropped.items() if n},
         "share_of_chosen_with_enough_points": round(len(rows) / len(chosen), 4) if len(chosen) else 0.0,

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,9 @@ GIVE_UP = 100  # pairs of one range of angle that fail in a row: the views of lo
 class PairsConfig:
     """Which pairs of views are chosen."""
 
+    choose: Literal["auto", "spread", "made"] = "auto"
+    """"spread": over ranges of angle, within the limits; "made": views 2k and 2k + 1 of sequences made in pairs, at
+    whatever angle; "auto": made where the sequence was, else spread."""
     min_angle_deg: float = 5.0
     """Smallest angle between the two views, seen from the object; below it a pair is the same view twice."""
     max_angle_deg: float = 90.0
@@ -95,3 +99,19 @@ def select_pairs(
                 if failed[b] >= GIVE_UP:
                     waiting[b] = waiting[b][:0]
     return np.array(chosen, dtype=np.intp).reshape(-1, 2)
+
+
+def made_pairs(frames: Sequence[int], overlap: Callable[[int, int], float], config: PairsConfig) -> NDArray[np.intp]:
+    """The pairs that a sequence was made in, of which both views are there and overlap.
+
+    Args:
+        frames: numbers of the n views.
+        overlap: as in `select_pairs`.
+
+    Returns:
+        (P, 2) indices of views 2k and 2k + 1, at most `max_pairs`.
+    """
+    place = {frame: index for index, frame in enumerate(frames)}
+    there = [(index, place[frame + 1]) for frame, index in place.items() if frame % 2 == 0 and frame + 1 in place]
+    chosen = [pair for pair in there if overlap(*pair) >= config.min_overlap]
+    return np.array(chosen[: config.max_pairs], dtype=np.intp).reshape(-1, 2)

@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -57,6 +57,9 @@ class ViewsConfig:
     """Take frames more densely where fewer than this many would be left of a short sequence."""
     size: int = 224
     """Side of the square views in pixels."""
+    crop: Literal["auto", "object", "whole"] = "auto"
+    """"object": the square around it; "whole": the largest square in the middle of the image; "auto": whole for
+    renders, whose cameras were drawn so that the object fills more or less of the view, else object."""
     margin: float = 0.1
     """Room around the object's bounding box, as a share of its longer side, on each side; less at the image's edge."""
     min_object_px: int = 24
@@ -122,6 +125,8 @@ def build_views(sequence: Sequence, config: ViewsConfig, skipped: Counter[str] |
         raise BadInput("no frame has a camera", where=sequence.folder, remedy="Run `dope prep colmap` first")
     if not any(frame.mask for frame in frames):
         raise BadInput("has no masks of the object", where=sequence.folder, remedy="Run `dope prep masks` first")
+    if config.crop == "auto":
+        config = replace(config, crop="whole" if sequence.read_info().kind == "render" else "object")
     for frame in sample_frames(frames, config):
         view = _view_of(sequence, frame, config) if frame.registered and frame.image else "not registered"
         if isinstance(view, View):
@@ -143,7 +148,8 @@ def _view_of(sequence: Sequence, frame: Frame, config: ViewsConfig) -> View | st
     extent = object_extent(mask)
     if extent is None:
         return "empty mask"
-    if max(np.ptp(extent[:, 0]), np.ptp(extent[:, 1])) + 1 < config.min_object_px:
+    small = max(np.ptp(extent[:, 0]), np.ptp(extent[:, 1])) + 1 < config.min_object_px
+    if small and config.crop != "whole":
         return f"object smaller than {config.min_object_px} px"
     return cut_view(frame.frame, camera, image, mask, sequence.read_depth(frame), extent, config)
 
@@ -182,6 +188,14 @@ def crop_camera(camera: Camera, extent: NDArray[np.floating], size: int, margin:
     return Camera(size, size, K @ camera.K, np.zeros(4), camera.R, camera.t)
 
 
+def middle_camera(camera: Camera, size: int) -> Camera:
+    """The pinhole camera of the largest square in the middle of an image, `size` pixels wide."""
+    side = min(camera.width, camera.height)
+    shift = np.array([[1, 0, -(camera.width - side) / 2], [0, 1, -(camera.height - side) / 2], [0, 0, 1.0]])
+    K = np.diag([size / side, size / side, 1.0]) @ shift @ camera.K
+    return Camera(size, size, K, np.zeros(4), camera.R, camera.t)
+
+
 def cut_view(
     number: int,
     camera: Camera,
@@ -201,7 +215,13 @@ def cut_view(
         extent: (N, 2) outline of the object, see `object_extent`.
     """
     size = config.size
-    crop = crop_camera(camera, extent, size, config.margin)
+    if config.crop == "whole":
+        crop = middle_camera(camera, size)
+        same = (camera.width, camera.height) == (size, size) and not camera.is_distorted
+        if same and (depth is None or depth.shape == mask.shape):  # nothing is to be resampled
+            return View(number, image, mask, depth, crop, 1.0, (0.0, 0.0, float(size)))
+    else:
+        crop = crop_camera(camera, extent, size, config.margin)
     scale = camera.K[0, 0] / crop.K[0, 0]  # stored pixels a pixel of the view
     # at least as many samples as there are stored pixels, then a box filter: no aliasing, and no shift of half a pixel
     finer = max(1, math.ceil(scale - 1e-6))

@@ -92,7 +92,7 @@ class MeshConfig:
     up: Literal["auto", "z", "y", "x"] = "auto"
     """The axis of the file that points up; "auto": y in glTF and ShapeNet, z elsewhere."""
     pose: Literal["stable", "upright"] = "stable"
-    """"stable": lying as it would come to rest on the plane, drawn by how probable that is; "upright": as in the file."""
+    """"stable": as it would come to rest on the plane, drawn by how probable that is; "upright": as in the file."""
     min_mask_share: float = 0.005
     """Pairs of which a view shows less of the object are dropped."""
 
@@ -118,7 +118,7 @@ class RenderConfig:
     """The rasteriser."""
     cycles: CyclesConfig = field(default_factory=CyclesConfig)
     """The path tracer."""
-    jpeg_quality: int = 95
-    """Of the images."""
+    jpeg_quality: int = 97
+    """Of the images; views are encoded once more."""
     seed: int = 0
     """Of everything that is drawn, together with the object's id."""

@@ -169,7 +169,7 @@ def write_sequence(
         SequenceInfo(
             sequence.id,
             source=f"synthetic {scene.shape}",
-            kind="render",
+            kind="photos",
             category=category,
             instance=instance or sequence.id,
             unit="object radius",
