@@ -11,8 +11,9 @@ from pipeline.correspond.depth_sampling import DepthSampler
 from pipeline.geometry import Camera, Floats
 from pipeline.render.scene import Picture
 
-SAME_SURFACE = 0.01
-"""Relative difference of depths up to which a place is taken to be visible in both views."""
+SAME_SURFACE = 0.005
+"""Relative difference of depths up to which a place is taken to be visible in both views; with twice as much, places
+just behind a round object's limb would be."""
 
 
 @dataclass(frozen=True)
