@@ -55,7 +55,7 @@ def render(
     category_from: Annotated[
         str,
         typer.Option(
-            help="auto: by the layout (ModelNet, ShapeNet, ABC), or the folder above the mesh where a folder of folders "
+            help="auto: by the layout (ModelNet, ShapeNet, ABC), or the folder above where a folder of folders "
             "is given; parent: always that folder; none.",
             rich_help_panel=OBJECTS,
         ),

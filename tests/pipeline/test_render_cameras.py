@@ -81,5 +81,5 @@ def test_pictures_that_are_wrong_do_not(wrong: str) -> None:
     elif wrong == "half a pixel":
         camera = replace(camera, K=camera.K + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]))
     else:
-        camera = replace(camera, t=camera.t + np.array([0.01, 0, 0]))
+        camera = replace(camera, t=camera.t + np.array([0.02, 0, 0]))
     assert np.median(seen_by_both(one, camera, two, other).miss_px) > 0.1
