@@ -328,8 +328,15 @@ def _stored(sequence: Sequence, frame: Frame) -> Picture:
 
 def describe_depth(sequence: Sequence) -> dict[str, Any]:
     """The stage `depth`: what of the object has depth; it was written along with the pictures."""
-    shares = []
+    known, covered = [], []
     for frame in sequence.registered_frames():
         picture = _stored(sequence, frame)
-        shares.append(float((picture.depth[picture.mask] > 0).mean()))
-    return {"method": "rendered", "maps": len(shares), "coverage": round(float(np.mean(shares)), 4), "warnings": []}
+        known.append(float((picture.depth > 0).mean()))
+        covered.append(float((picture.depth[picture.mask] > 0).mean()))
+    return {
+        "method": "rendered",
+        "frames_with_depth": len(known),
+        "coverage": round(float(np.mean(known)), 4),
+        "mask_coverage": round(float(np.mean(covered)), 4),
+        "warnings": [],
+    }
