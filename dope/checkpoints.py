@@ -203,6 +203,7 @@ def resume(path: Path, state: TrainState, config: TrainConfig, dataset: str) -> 
         BadInput: the checkpoint cannot be read.
         UsageError: it was made with other settings (all that differ are named) or from other shards.
     """
+    path = find_checkpoint(path)
     values = read_checkpoint(path, next(state.network.parameters()).device)
     # a setting younger than the checkpoint had its default's effect then
     differing = differing_keys(settings.to_dict(config), merged(settings.to_dict(TrainConfig()), values["config"]))

@@ -174,9 +174,36 @@ def no_shards_listed(folder: Path) -> None:
     (folder / "dataset.json").write_text(json.dumps({"counts": {}}))
 
 
+def manifest_of_another_kind(folder: Path) -> None:
+    (folder / "dataset.json").write_text("[]")
+
+
+def size_that_is_none(folder: Path) -> None:
+    path = folder / "dataset.json"
+    manifest = json.loads(path.read_text())
+    manifest["shards"]["train-000001.tar"]["bytes"] = "many"
+    path.write_text(json.dumps(manifest))
+
+
+def column(name: str, values: list[object]) -> Callable[[Path], None]:
+    def damage(folder: Path) -> None:
+        forget_hashes(folder)
+        table = pq.read_table(folder / "index.parquet")
+        of = pa.array([values[i % len(values)] for i in range(len(table))])
+        table = table.set_column(table.schema.get_field_index(name), name, of)
+        pq.write_table(table, folder / "index.parquet")
+
+    return damage
+
+
 @pytest.mark.parametrize(
     ("damage", "file", "what"),
     [
+        (manifest_of_another_kind, "dataset.json", "lists no shards"),
+        (size_that_is_none, "dataset.json", "lists no shards"),
+        (column("offset", ["a"]), "index.parquet", "values of another kind"),
+        (column("split", [1]), "index.parquet", "values of another kind"),
+        (column("n_correspondences", [None, 3]), "index.parquet", "has rows without n_correspondences"),
         (cut, "train-000001.tar", "cut off"),
         (remove, "train-000001.tar", "missing"),
         (exchange, "train-000000.tar", "another dataset|cut off"),
