@@ -35,8 +35,10 @@ if TYPE_CHECKING:
 
 FORMAT = 1
 LATEST, BEST, ORIGIN = "latest", "best", "origin"
-PARTS = ("step", "epoch", "samples_consumed", "network", "momentum", "optimiser", "config", "config_hash", "dataset")
-PARTS = (*PARTS, "validation", "untrained", "versions")
+PARTS = (
+    "step", "epoch", "samples_consumed", "network", "momentum", "optimiser", "config", "config_hash", "dataset",
+    "validation", "untrained", "versions",
+)  # fmt: skip
 """What a checkpoint of this format has; `damaged` came later."""
 
 
