@@ -89,6 +89,8 @@ def train(
                 state.momentum.update(state.network)
 
                 state.step, state.place = state.step + 1, run.order.after(state.place)
+                # other ranks would have to be asked first, which the next step does
+                asked_to_stop |= ranks.world == 1 and stop.requested
                 stopping = asked_to_stop or state.step >= last_step
                 if memory is not None:
                     log.event("memory", state.step, state.place.epoch, memory.report())

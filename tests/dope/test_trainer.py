@@ -9,6 +9,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -17,6 +18,7 @@ from many_ranks import part
 from tiny_runs import TINY, losses_of, tiny
 from tiny_shards import write_shards
 
+from dope import trainer
 from dope.augmentation import Share, no_augmentation
 from dope.batch import PairBatch
 from dope.checkpoints import list_checkpoints, load_network
@@ -72,6 +74,19 @@ def test_stopping_and_going_on_is_bitwise_the_same(shards: Path, tmp_path: Path)
     assert losses_of(tmp_path / "whole") == losses_of(tmp_path / "parts")
     ours, theirs = (load_network(tmp_path / name)[0].state_dict() for name in ("whole", "parts"))
     assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+
+
+def test_a_signal_within_a_step_ends_the_run_after_this_very_step(
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = trainer.compute_losses
+
+    def signalled(*arguments: Any, **options: Any) -> StepLosses:
+        os.kill(os.getpid(), signal.SIGUSR1)
+        return real(*arguments, **options)
+
+    monkeypatch.setattr(trainer, "compute_losses", signalled)
+    assert train(shards, tmp_path, tiny("validation.every=0"))["step"] == 1
 
 
 def test_max_steps_ends_a_run(shards: Path, tmp_path: Path) -> None:
