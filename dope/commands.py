@@ -55,6 +55,14 @@ def train(
         int | None,
         typer.Option(min=0, help="Damaged samples to put up with.  [default: 0]", show_default=False),
     ] = None,
+    verify_shards: Annotated[
+        bool,
+        typer.Option(
+            "--verify-shards",
+            help="Read every shard whole before training and compare its SHA-256: finds changed bytes that can be "
+            "decoded all the same.",
+        ),
+    ] = False,
 ) -> None:
     """Train DOPE: corresponding pixels of two views get the same descriptor, all others different ones.
 
@@ -85,6 +93,10 @@ def train(
     resolved = load_config(preset, config, overrides)
     from dope.launch import as_rank, is_rank, launch
 
+    if verify_shards and not is_rank() and os.environ.get("RANK", "0") == "0":
+        from dope.shard_index import verify_hashes
+
+        verify_hashes(shards)
     if nproc > 1 and not is_rank():
         raise typer.Exit(launch(nproc, max_restarts))
 

@@ -13,6 +13,7 @@ import pytest
 import torch
 from tiny_shards import make_pair, write_shards
 
+from dope import commands
 from dope.common.errors import BadInput, DopeError
 from dope.shard_index import read_index, verify_hashes
 from dope.streaming import PairDataset, PairLoader, collate
@@ -300,3 +301,16 @@ def test_the_helper_is_deterministic_and_stock_webdataset_reads_it(shards: Path,
     stock = webdataset.WebDataset(str(shards / "train-000000.tar"), shardshuffle=False)
     assert [sample["__key__"] for sample in stock] == list(read_index(shards, "train").keys[:10])
     subprocess.run(["tar", "tf", str(shards / "val-000000.tar")], check=True, capture_output=True)
+
+
+def test_changed_bytes_that_can_be_decoded_are_found_on_request(copy: Path, tmp_path: Path) -> None:
+    row = PairDataset(copy, "train", image_size=64).index.location(3)
+    path = copy / row.shard
+    data = bytearray(path.read_bytes())
+    place = data.index(b"NUMPY", row.offset) + 200  # within the points
+    data[place] ^= 1
+    path.write_bytes(data)
+    assert len(PairDataset(copy, "train", image_size=64)[3].points), "else nothing is shown"
+    with pytest.raises(BadInput, match=f"{row.shard}: its SHA-256 is not the one in dataset.json"):
+        commands.train(str(copy), tmp_path / "run", preset="nano", verify_shards=True)
+    assert not (tmp_path / "run").exists()
