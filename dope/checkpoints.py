@@ -5,6 +5,8 @@
       step-00001200.pt.sha256   its hash, as `sha256sum -c` reads it
       latest                    the name of the newest one
       best                      with checkpoint.keep_best: the name of the one with the best PCK, and that PCK
+      origin                    what `--resume` named where it was not auto: the same command goes on, it does not begin
+                                there again (deleted, it does)
 
 Nothing random is stored: every random number derives from (seed, step). Files are written in this order and only
 then are old ones deleted, so that a crash at any moment leaves a checkpoint that `latest` or the list of files finds.
@@ -22,6 +24,7 @@ import dope
 from dope.common import files, settings
 from dope.common.errors import BadInput, UsageError
 from dope.config import CheckpointConfig, TrainConfig, differing_keys
+from dope.distributed import restarts, started_by
 from dope.networks import DopeNetwork, NetworkConfig
 from dope.order import Place
 from dope.preset_files import merged
@@ -31,7 +34,12 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 FORMAT = 1
-LATEST, BEST = "latest", "best"
+LATEST, BEST, ORIGIN = "latest", "best", "origin"
+PARTS = (
+    "step", "epoch", "samples_consumed", "network", "momentum", "optimiser", "config", "config_hash", "dataset",
+    "validation", "untrained", "versions",
+)  # fmt: skip
+"""What a checkpoint of this format has; `damaged` came later."""
 
 
 def save_checkpoint(
@@ -162,9 +170,10 @@ def read_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str,
     older = [other for other in others if other.name < path.name]
     remedy = f"Give another one, e.g. {(older or others)[-1]}" if others else "Copy it again, or train again"
     recorded = _hash_path(path)
-    if recorded.is_file() and recorded.read_text().split(maxsplit=1)[:1] != [files.sha256_of(path)]:
-        raise BadInput(f"is damaged: its SHA-256 is not the one in {recorded.name}", where=path, remedy=remedy)
     try:
+        # bytes: a damaged one need not be text
+        if recorded.is_file() and recorded.read_bytes().split()[:1] != [files.sha256_of(path).encode()]:
+            raise BadInput(f"is damaged: its SHA-256 is not the one in {recorded.name}", where=path, remedy=remedy)
         values = torch.load(path, map_location=device, weights_only=True)
     except pickle.UnpicklingError as error:
         what = "holds something other than tensors and plain values: damage, or code, which is never run"
@@ -175,12 +184,17 @@ def read_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str,
     if not isinstance(values, dict) or "network" not in values or "format" not in values:
         raise BadInput("is no checkpoint of dope", where=path, remedy=remedy)
     if values["format"] != FORMAT:
-        version = values.get("versions", {}).get("dope", "unknown")
+        versions = values.get("versions")
+        version = versions.get("dope", "unknown") if isinstance(versions, dict) else "unknown"
         raise UsageError(
             f"was written by dope {version} in format {values['format']}; this one reads format {FORMAT}",
             where=path,
             remedy="Use that version of dope for this run, or train anew into another --out",
         )
+    missing = [part for part in PARTS if part not in values]
+    if missing or not isinstance(values["config"], dict):
+        what = f"lacks {', '.join(missing)}" if missing else "has settings that are none"
+        raise BadInput(what, where=path, remedy=remedy)
     return values
 
 
@@ -191,6 +205,7 @@ def resume(path: Path, state: TrainState, config: TrainConfig, dataset: str) -> 
         BadInput: the checkpoint cannot be read.
         UsageError: it was made with other settings (all that differ are named) or from other shards.
     """
+    path = find_checkpoint(path)
     values = read_checkpoint(path, next(state.network.parameters()).device)
     # a setting younger than the checkpoint had its default's effect then
     differing = differing_keys(settings.to_dict(config), merged(settings.to_dict(TrainConfig()), values["config"]))
@@ -207,9 +222,14 @@ def resume(path: Path, state: TrainState, config: TrainConfig, dataset: str) -> 
             where=path,
             remedy="Go on with the same shards, or train anew into another --out",
         )
-    state.network.load_state_dict(values["network"])
-    state.momentum.network.load_state_dict(values["momentum"])
-    state.optimiser.load_state_dict(values["optimiser"])
+    try:
+        state.network.load_state_dict(values["network"])
+        state.momentum.network.load_state_dict(values["momentum"])
+        state.optimiser.load_state_dict(values["optimiser"])
+    except (RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:
+        reason = str(error).split("\n", 1)[0]
+        remedy = "Give another one, or train anew into another --out"
+        raise BadInput(f"does not fit the network of its settings ({reason})", where=path, remedy=remedy) from error
     state.step, state.place = values["step"], Place(values["epoch"], values["samples_consumed"])
     state.validation, state.untrained = values["validation"], values["untrained"]
     state.damaged = set(values.get("damaged", ()))
@@ -247,27 +267,56 @@ def go_on_from(
 ) -> tuple[Path | None, list[BadInput]]:
     """Put `state` where the `how` of `dope train --resume` says: auto, never, or a checkpoint or run.
 
+    A command that names a checkpoint and is given again (a requeued job, ranks that are started anew) goes on from the
+    newest one that it has made since, see `note_origin`.
+
     Returns:
         The checkpoint, or None where the run begins; and what was wrong with newer ones.
 
     Raises:
-        BadInput: no such checkpoint, or it (with `auto`, every one of the run) is damaged.
-        UsageError: as `resume`; or `never`, and `out` holds a run.
+        BadInput: no such checkpoint, or it (where the run goes on, every one of it) is damaged.
+        UsageError: as `resume`; or `never` or a checkpoint of another run, and `out` holds a run.
     """
-    if how == "auto":
+    newest = latest_checkpoint(out)
+    if how == "auto" or (newest is not None and _began_like_this(how, out)):
         return resume_newest(out, state, config, dataset)
-    if how == "never":
-        newest = latest_checkpoint(out)
-        if newest is not None:
-            raise UsageError(
-                f"already holds a run ({newest.name})",
-                where=out,
-                remedy="Give another --out, delete this folder, or go on with --resume auto",
-            )
-        return None, []
-    found = find_checkpoint(Path(how))
-    resume(found, state, config, dataset)
+    found = None if how == "never" else find_checkpoint(Path(how))
+    if newest is not None and (found is None or not _is_of(found, out)):
+        raise UsageError(
+            f"already holds a run ({newest.name})",
+            where=out,
+            remedy="Give another --out, delete this folder, or go on with --resume auto",
+        )
+    if found is not None:
+        resume(found, state, config, dataset)
     return found, []
+
+
+def note_origin(how: str | Path, out: Path, found: Path | None) -> None:
+    """Write down that `out` begins, by `--resume how`, at the checkpoint `found`; nothing to note for `auto`.
+
+    Where it goes back to an earlier checkpoint of its own, that one is its newest from now on.
+    """
+    if how == "auto" or _began_like_this(how, out):
+        return
+    if found is not None and _is_of(found, out):
+        files.write_bytes(out / "checkpoints" / LATEST, f"{found.name}\n".encode())
+    files.write_bytes(out / "checkpoints" / ORIGIN, f"{_origin(how)}\n".encode())
+
+
+def _origin(how: str | Path) -> str:
+    return f"never, {started_by()}" if how == "never" else str(Path(how).resolve())
+
+
+def _began_like_this(how: str | Path, out: Path) -> bool:
+    """Whether `out` was begun by this very command; one that insists on a new folder is the same only in a restart."""
+    file = out / "checkpoints" / ORIGIN
+    noted = file.read_text(errors="replace").rstrip("\n") if file.is_file() else None
+    return noted == _origin(how) and (how != "never" or restarts() > 0)
+
+
+def _is_of(checkpoint: Path, run: Path) -> bool:
+    return checkpoint.parent.resolve() == (run / "checkpoints").resolve()
 
 
 def load_network(path: Path, device: torch.device | str = "cpu") -> tuple[DopeNetwork, dict[str, Any]]:

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
-import subprocess
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -37,9 +34,13 @@ def train(
         typer.Option("--set", metavar="KEY=VALUE", help="One setting, e.g. optimiser.lr=3e-4.", show_default=False),
     ] = None,
     resume: Annotated[
-        str, typer.Option(help="auto: go on where RUN stopped; never: insist on a new RUN; or a checkpoint.")
+        str,
+        typer.Option(
+            help="auto: go on where RUN stopped; never: insist on a new RUN; or a checkpoint to begin from: one of RUN "
+            "goes back, one of another run needs a new RUN, and the same command again goes on."
+        ),
     ] = "auto",
-    nproc: Annotated[int, typer.Option(min=1, help="Processes on this machine (what torchrun would start).")] = 1,
+    nproc: Annotated[int, typer.Option(min=1, help="Processes on this machine (torchrun starts them on several).")] = 1,
     max_restarts: Annotated[
         int, typer.Option(min=0, help="With --nproc: times that all processes start again after one died.")
     ] = 0,
@@ -54,6 +55,14 @@ def train(
         int | None,
         typer.Option(min=0, help="Damaged samples to put up with.  [default: 0]", show_default=False),
     ] = None,
+    verify_shards: Annotated[
+        bool,
+        typer.Option(
+            "--verify-shards",
+            help="Read every shard whole before training and compare its SHA-256: finds changed bytes that can be "
+            "decoded all the same.",
+        ),
+    ] = False,
 ) -> None:
     """Train DOPE: corresponding pixels of two views get the same descriptor, all others different ones.
 
@@ -64,9 +73,9 @@ def train(
     Slurm, in a script with #SBATCH --requeue and --signal=USR1@120 (the signal comes 120 s before the limit):
     srun dope train shards --out run || { [ $? = 75 ] && scontrol requeue $SLURM_JOB_ID; }
 
-    When one of several processes dies, torchrun notices within a second and ends the others (SIGTERM, after 30 s
-    SIGKILL); with --max-restarts it then starts all of them again, and they go on from RUN's newest checkpoint:
-    --set checkpoint.every says how much is done twice.
+    When one of several processes dies, the others are ended (SIGTERM, after 30 s SIGKILL); with --max-restarts all of
+    them are then started again and go on from RUN's newest checkpoint: --set checkpoint.every says how much is done
+    twice. Errors that would come again, such as wrong settings, end the run.
 
     Examples:
 
@@ -82,16 +91,21 @@ def train(
 
     overrides = [*(set_ or ()), *([] if max_bad_samples is None else [f"data.max_bad_samples={max_bad_samples}"])]
     resolved = load_config(preset, config, overrides)
-    if nproc > 1 and "RANK" not in os.environ:
-        from dope.shard_index import read_index
+    from dope.launch import as_rank, is_rank, launch
 
-        read_index(shards, "train")  # what is wrong with them is said once, here, not by every process
-        raise typer.Exit(_launch(nproc, max_restarts))
+    if verify_shards and not is_rank() and os.environ.get("RANK", "0") == "0":
+        from dope.shard_index import verify_hashes
+
+        verify_hashes(shards)
+    if nproc > 1 and not is_rank():
+        raise typer.Exit(launch(nproc, max_restarts))
 
     from dope.stop_signals import EXIT_STOPPED
-    from dope.trainer import train as run_training
 
-    result = run_training(shards, out, resolved, resume=resume, stop_after=stop_after, profile=profile or 0)
+    with as_rank():
+        from dope.trainer import train as run_training
+
+        result = run_training(shards, out, resolved, resume=resume, stop_after=stop_after, profile=profile or 0)
     if os.environ.get("RANK", "0") == "0":
         _print_training(result, out)
     raise typer.Exit(EXIT_STOPPED if result["status"] == "stopped" and stop_after is None else 0)
@@ -212,37 +226,6 @@ def figure(
     options |= {"sequences": sequence, "views": views, "limit": limit, "device": _device(device)}
     for path in draw_figures(find_checkpoint(run), shards, out, **options):
         typer.echo(path)
-
-
-def _launch(nproc: int, max_restarts: int) -> int:
-    """Start this very command under torchrun, without --nproc's effect in the children (they see RANK).
-
-    A process that dies ends the others, too: torchrun looks every 0.1 s, sends SIGTERM, and SIGKILL to those that are
-    left after 30 s, e.g. waiting on a GPU for the dead one. After that it starts all of them again, or gives up.
-
-    SIGTERM, SIGUSR1 and Ctrl-C are handed on as SIGTERM, and torchrun lets the processes write a checkpoint (it waits
-    30 s). It ends with 1 however they ended; a run that was asked to stop ends with 75 here, as that of one process
-    does.
-    """
-    from dope.stop_signals import EXIT_STOPPED, STOP_SIGNALS
-
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(nproc)]
-    command += ["--max-restarts", str(max_restarts)]
-    asked = False
-    # torchrun inherits this: Slurm sends SIGUSR1 to every process, and torchrun would die of it
-    signal.signal(signal.SIGUSR1, signal.SIG_IGN)
-    # "--", or torchrun takes our --nproc for its own; its own process group, or Ctrl-C of a terminal reaches it twice
-    process = subprocess.Popen([*command, "-m", "--", "cli", *sys.argv[1:]], start_new_session=True)
-
-    def hand_on(number: int, frame: object) -> None:
-        nonlocal asked
-        asked = True
-        process.terminate()
-
-    for number in STOP_SIGNALS:
-        signal.signal(number, hand_on)
-    code = process.wait()
-    return EXIT_STOPPED if asked and code else code
 
 
 def _print_training(result: dict[str, Any], out: Path) -> None:

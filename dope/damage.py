@@ -23,6 +23,8 @@ def heed(run: Run, stop: bool, batch: PairBatch, log: RunLog | SilentLog) -> boo
     count(run, [one for _, some, _ in said for one in some], log)
     for rank, (_, some, whole_share) in enumerate(said):
         if whole_share:
+            if run.state.step:
+                run.save(log)  # as in `count`
             raise BadInput(
                 f"all {len(some)} samples of rank {rank} at step {run.state.step} are damaged, the first one: "
                 f"{some[0].reason}",

@@ -18,6 +18,7 @@ from dope.tar_samples import REMAKE
 REDUCED = {8: cv2.IMREAD_REDUCED_COLOR_8, 4: cv2.IMREAD_REDUCED_COLOR_4, 2: cv2.IMREAD_REDUCED_COLOR_2}
 """The shares of its size at which a JPEG can be decoded, at a fraction of the time."""
 START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+END_OF_IMAGE = b"\xff\xd9"
 NPY = re.compile(
     rb"\x93NUMPY\x01\0..\{'descr': '<f4', 'fortran_order': False, 'shape': \((\d+), 4\), \} *\n", re.DOTALL
 )
@@ -97,8 +98,11 @@ def decode_points(data: bytes, max_points: int, where: str) -> NDArray[np.float3
         return np.frombuffer(data, "<f4", min(max_points, int(head[1])) * 4, head.end()).reshape(-1, 4)
     try:
         points = np.load(io.BytesIO(data), allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        raise BadInput(f"corr.npy cannot be read ({error})", where=where, remedy=REMAKE) from error
+    except Exception as error:  # its header is Python, which fails in as many ways, or asks for terabytes
+        reason = str(error).split("\n", 1)[0]
+        raise BadInput(f"corr.npy cannot be read ({reason})", where=where, remedy=REMAKE) from error
+    if not isinstance(points, np.ndarray):
+        raise BadInput("corr.npy is no array", where=where, remedy=REMAKE)
     if points.ndim != 2 or points.shape[1] != 4 or points.dtype.kind != "f":
         raise BadInput(f"corr.npy is {points.dtype} {points.shape}, not float32 (N, 4)", where=where, remedy=REMAKE)
     return points[:max_points].astype(np.float32)
@@ -114,10 +118,12 @@ def resized(image: NDArray[Any], size: int | None) -> NDArray[Any]:
 
 def _image(members: Mapping[str, bytes], name: str, out: NDArray[np.uint8], where: str) -> tuple[float, float]:
     """Write a JPEG into `out` (3, S, S) as RGB; return by what x and y of its points are multiplied."""
-    size = out.shape[-1]
-    image, reduction = decode_jpeg(_member(members, name, where), size)
+    size, data = out.shape[-1], _member(members, name, where)
+    image, reduction = decode_jpeg(data, size)
     if image is None:
         raise BadInput(f"{name} cannot be decoded", where=where, remedy=REMAKE)
+    if not data.rstrip(b"\0").endswith(END_OF_IMAGE):  # the decoder fills up with grey
+        raise BadInput(f"{name} is cut off", where=where, remedy=REMAKE)
     height, width = (reduction * side for side in image.shape[:2])
     cv2.split(resized(image, size), list(out[::-1]))  # into these arrays, BGR to RGB
     return size / width, size / height

@@ -86,9 +86,9 @@ def ranks_of(device: str) -> Iterator[Ranks]:
         device: auto, cpu, cuda or cuda:N; with several ranks, cuda means the GPU of the local rank.
 
     Raises:
-        UsageError: an unknown or absent device.
+        UsageError: an unknown or absent device, or an environment that describes no run.
     """
-    world = int(os.environ.get("WORLD_SIZE", "1"))
+    world = world_size()
     chosen = pick_device(device, int(os.environ.get("LOCAL_RANK", "0")) if world > 1 else 0)
     if chosen.type == "cuda":
         torch.cuda.set_device(chosen)
@@ -107,9 +107,27 @@ def ranks_of(device: str) -> Iterator[Ranks]:
         dist.destroy_process_group()
 
 
+def world_size() -> int:
+    """How many ranks the environment says there are. Raises `UsageError` where it says more than one and no more."""
+    world = os.environ.get("WORLD_SIZE", "1")
+    absent = [name for name in ("RANK", "MASTER_ADDR", "MASTER_PORT") if name not in os.environ]
+    if world != "1" and (absent or not world.isdecimal()):
+        raise UsageError(
+            f"the environment has WORLD_SIZE={world}" + (f", but no {' and no '.join(absent)}" if absent else ""),
+            where="WORLD_SIZE",
+            remedy="Start the processes by --nproc or torchrun, or unset it",
+        )
+    return int(world)
+
+
 def restarts() -> int:
     """How often torchrun has started the ranks again, in this call, because one died."""
     return int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"))
+
+
+def started_by() -> str:
+    """Names the call of torchrun that started the ranks, the same after it started them again."""
+    return os.environ.get("TORCHELASTIC_RUN_ID", "")
 
 
 def pick_device(name: str, local_rank: int = 0, *, flag: str = "--set device=") -> torch.device:

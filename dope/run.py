@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,13 +15,14 @@ from dope.batch import DamagedSample, PairBatch
 from dope.common import files, settings
 from dope.common.errors import BadInput, DopeError
 from dope.config import TrainConfig, write_config
-from dope.distributed import Ranks, restarts
+from dope.distributed import Ranks
 from dope.figures.held_out import held_out_sheet
 from dope.meter import Meter
 from dope.networks import DopeNetwork
 from dope.networks.untrained import settle_batchnorm
 from dope.order import SampleOrder
 from dope.queries import micro_batches, resolved_precision
+from dope.run_lock import only_one
 from dope.run_logging import RunLog, SilentLog, describe_start
 from dope.state import TrainState, new_state, total_steps
 from dope.storage import Shards
@@ -176,8 +179,12 @@ class Run:
         return result
 
 
-def open_run(shards: Shards, out: Path, config: TrainConfig, ranks: Ranks, resume: str | Path) -> Run:
-    """Check the shards, make the network, and go back to where the run stopped; nothing is written yet."""
+@contextmanager
+def open_run(shards: Shards, out: Path, config: TrainConfig, ranks: Ranks, resume: str | Path) -> Iterator[Run]:
+    """Check the shards, make the network, and go back to where the run stopped; `out` is this run's own meanwhile.
+
+    Nothing is written yet but RUN/.lock, and where the run begins from another checkpoint.
+    """
     if config.log.wandb:
         require_wandb()
     data = config.data
@@ -203,13 +210,31 @@ def open_run(shards: Shards, out: Path, config: TrainConfig, ranks: Ranks, resum
         micro_batches(data.batch_size // ranks.world, data.micro_batch)
     held_out, held_out_damaged = read_held_out(shards, config, ranks)
     state = new_state(config, ranks)
-    if restarts() and checkpoints.latest_checkpoint(out) is not None:
-        resume = "auto"  # whatever it began from: torchrun has started the ranks again in the midst of this call
-    found, damaged = checkpoints.go_on_from(resume, out, state, config, dataset.index.fingerprint)
-    if len(set(ranks.collect(state.step))) > 1:
-        what = "the ranks do not see the same checkpoints"
-        raise DopeError(what, where=out / "checkpoints", remedy="All machines must share this folder")
-    return Run(out, config, ranks, dataset, order, held_out, held_out_damaged, state, found, damaged)
+    with _on_first(ranks, lambda: only_one(out)):
+        fingerprint = dataset.index.fingerprint
+        found, damaged = checkpoints.go_on_from(resume, out, state, config, fingerprint)
+        if len(set(ranks.collect(state.step))) > 1:
+            what = "the ranks do not see the same checkpoints"
+            raise DopeError(what, where=out / "checkpoints", remedy="All machines must share this folder")
+        if ranks.is_first:
+            checkpoints.note_origin(resume, out, found)
+        yield Run(out, config, ranks, dataset, order, held_out, held_out_damaged, state, found, damaged)
+
+
+@contextmanager
+def _on_first(ranks: Ranks, entered: Callable[[], AbstractContextManager[None]]) -> Iterator[None]:
+    """Hold something on the first rank; where it cannot be had, the error is raised on all ranks alike."""
+    with ExitStack() as stack:
+        error: DopeError | None = None
+        if ranks.is_first:
+            try:
+                stack.enter_context(entered())
+            except DopeError as refused:
+                error = refused
+        error = ranks.collect(error)[0]
+        if error is not None:
+            raise error
+        yield
 
 
 def read_held_out(shards: Shards, config: TrainConfig, ranks: Ranks) -> tuple[list[PairBatch], list[DamagedSample]]:

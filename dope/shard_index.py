@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from dope.common.errors import BadInput
-from dope.storage import REMEDY, Shards, Storage, open_storage
+from dope.storage import REMEDY, Shards, Storage, open_storage, reason_of
 from dope.tar_samples import REMAKE, Location, OtherSample, ShardReader
 
 COLUMNS = ("key", "shard", "offset", "size", "sequence", "split", "n_correspondences")
@@ -87,24 +87,30 @@ def read_index(shards: Shards, split: str) -> SampleIndex:
     sizes = storage.sizes()
     manifest = read_manifest(storage, sizes)
     table, digest = read_table(storage, "index.parquet", COLUMNS)
-    recorded = storage.read_json("dataset.json").get("tables", {}).get("index.parquet")
-    if recorded is not None and digest != recorded:
+    tables = storage.read_json("dataset.json").get("tables")
+    if isinstance(tables, dict) and tables.get("index.parquet", digest) != digest:
         raise BadInput("is not the one of dataset.json", where=storage.where("index.parquet"), remedy=REMAKE)
-    sequences = np.unique(table["sequence"].to_numpy(zero_copy_only=False).astype(str))
-    table = table.filter(pc.equal(table["split"], split))
-    columns = {name: table[name].to_numpy(zero_copy_only=False) for name in COLUMNS}
-    names = columns["sequence"].astype(str)
-    index = SampleIndex(
-        storage=storage,
-        keys=columns["key"].astype(str),
-        shards=columns["shard"].astype(str),
-        sequences=names,
-        offsets=columns["offset"].astype(np.int64),
-        sizes=columns["size"].astype(np.int64),
-        correspondences=columns["n_correspondences"].astype(np.int64),
-        objects=np.searchsorted(sequences, names),
-        fingerprint=_fingerprint({name: manifest[name]["sha256"] for name in sorted(manifest) if _is_of(name, split)}),
-    )
+    try:
+        sequences = np.unique(table["sequence"].to_numpy(zero_copy_only=False).astype(str))
+        table = table.filter(pc.equal(table["split"], split))
+        columns = {name: table[name].to_numpy(zero_copy_only=False) for name in COLUMNS}
+        names = columns["sequence"].astype(str)
+        index = SampleIndex(
+            storage=storage,
+            keys=columns["key"].astype(str),
+            shards=columns["shard"].astype(str),
+            sequences=names,
+            offsets=columns["offset"].astype(np.int64),
+            sizes=columns["size"].astype(np.int64),
+            correspondences=columns["n_correspondences"].astype(np.int64),
+            objects=np.searchsorted(sequences, names),
+            fingerprint=_fingerprint(
+                {name: manifest[name]["sha256"] for name in sorted(manifest) if _is_of(name, split)}
+            ),
+        )
+    except (pa.ArrowException, ValueError, TypeError) as error:
+        what = f"has values of another kind than `dope prep shards` writes ({reason_of(error)})"
+        raise BadInput(what, where=storage.where("index.parquet"), remedy=REMAKE) from error
     _check_shards(index, manifest, sizes, split)
     return index
 
@@ -117,8 +123,9 @@ def read_manifest(storage: Storage, files: dict[str, int]) -> dict[str, dict[str
             where=storage.address,
             remedy=f"{REMEDY}; dataset.json is written last, so an interrupted run must be run again",
         )
-    shards = storage.read_json("dataset.json").get("shards")
-    if not isinstance(shards, dict) or not all(isinstance(s, dict) and "sha256" in s for s in shards.values()):
+    values = storage.read_json("dataset.json")
+    shards = values.get("shards") if isinstance(values, dict) else None
+    if not isinstance(shards, dict) or not all(map(_describes_shard, shards.values())):
         raise BadInput("lists no shards", where=storage.where("dataset.json"), remedy=REMAKE)
     return shards
 
@@ -145,6 +152,9 @@ def read_table(storage: Storage, name: str, columns: Sequence[str]) -> tuple[pa.
     missing = [column for column in columns if column not in table.column_names]
     if missing:
         raise BadInput(f"lacks the columns {', '.join(missing)}", where=storage.where(name), remedy=REMAKE)
+    holes = [column for column in columns if table[column].null_count]
+    if holes:
+        raise BadInput(f"has rows without {', '.join(holes)}", where=storage.where(name), remedy=REMAKE)
     return table, hashlib.sha256(data).hexdigest()
 
 
@@ -192,6 +202,12 @@ def _check_samples(index: SampleIndex, first: NDArray[np.integer]) -> None:
                 if isinstance(other, BadInput):
                     raise members
     reader.close()
+
+
+def _describes_shard(entry: Any) -> bool:
+    if not isinstance(entry, dict) or not isinstance(entry.get("sha256"), str):
+        return False
+    return all(isinstance(entry.get(name, 0), int) for name in ("bytes", "samples"))
 
 
 def _is_of(shard: str, split: str) -> bool:

@@ -1,4 +1,4 @@
-"""SIGTERM, SIGUSR1 and Ctrl-C as a request: finish the step, write a checkpoint, leave."""
+"""SIGTERM, SIGUSR1, Ctrl-C and the end of a terminal as a request: finish the step, write a checkpoint, leave."""
 
 from __future__ import annotations
 
@@ -8,7 +8,12 @@ from types import FrameType
 from typing import Any
 
 EXIT_STOPPED = 75  # EX_TEMPFAIL: stopped with a checkpoint; the same command goes on
-STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
+STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1, signal.SIGHUP)
+
+
+def heeded_signals() -> list[int]:
+    """`STOP_SIGNALS`, without SIGHUP where `nohup` has it ignored."""
+    return [n for n in STOP_SIGNALS if n != signal.SIGHUP or signal.getsignal(n) != signal.SIG_IGN]
 
 
 class StopRequest:
@@ -24,7 +29,7 @@ class StopRequest:
 
     def __enter__(self) -> StopRequest:
         if threading.current_thread() is threading.main_thread():
-            self._before = {number: signal.signal(number, self._note) for number in STOP_SIGNALS}
+            self._before = {number: signal.signal(number, self._note) for number in heeded_signals()}
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset
 
 from dope.batch import DamagedSample, PairBatch
-from dope.common.errors import BadInput, DopeError
+from dope.common.errors import BadInput, DopeError, WorkerDied
 from dope.decoding import DecodedPair, decode_pair
 from dope.shard_index import SampleIndex, read_index
 from dope.stop_signals import STOP_SIGNALS
@@ -192,7 +192,7 @@ class PairLoader:
         except RuntimeError as error:
             if "DataLoader worker" not in str(error):
                 raise
-            raise DopeError(
+            raise WorkerDied(
                 f"a process that decodes samples died ({error})",
                 where=self._dataset.index.storage.address,
                 remedy="Memory or shared memory ran out: use --set data.workers=1, or in a container give "

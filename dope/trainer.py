@@ -39,7 +39,8 @@ def train(
         out: the run's folder: config.yaml, checkpoints/, metrics.jsonl, tensorboard/.
         config: all settings (see `dope.config.load_config`).
         resume: `auto` goes on where `out` stopped, or begins, and passes over damaged checkpoints; `never` insists on
-            a new folder; a path names a checkpoint or another run to go on from.
+            a new folder; a path names a checkpoint of `out`, or one or a run to begin a new `out` from, and when given
+            again goes on like `auto`.
         stop_after: stop with a checkpoint after so many steps of this call; the schedule stays that of the whole run.
         profile: steps of this call that are profiled, see `dope.profiling`.
 
@@ -51,12 +52,17 @@ def train(
     Raises:
         BadInput: shards or checkpoint missing or damaged, or more samples than `data.max_bad_samples` are.
         UsageError: settings that do not fit them.
-        DopeError: loss or gradient are not finite (the message names the step and the samples), or the disk is full.
+        DopeError: loss or gradient are not finite (the message names the step and the samples), the disk is full, or
+            another process trains into `out`.
     """
     check(config)
     keep_heap()
-    with files.explaining_full_disk(out), ranks_of(config.device) as ranks, StopRequest() as stop:
-        run = open_run(shards, out, config, ranks, resume)
+    with (
+        files.explaining_full_disk(out),
+        ranks_of(config.device) as ranks,
+        StopRequest() as stop,
+        open_run(shards, out, config, ranks, resume) as run,
+    ):
         state, last_step = run.state, run.total_steps
         if stop_after is not None:
             last_step = min(last_step, state.step + stop_after)
@@ -83,6 +89,8 @@ def train(
                 state.momentum.update(state.network)
 
                 state.step, state.place = state.step + 1, run.order.after(state.place)
+                # other ranks would have to be asked first, which the next step does
+                asked_to_stop |= ranks.world == 1 and stop.requested
                 stopping = asked_to_stop or state.step >= last_step
                 if memory is not None:
                     log.event("memory", state.step, state.place.epoch, memory.report())

@@ -43,5 +43,9 @@ class DiskFull(DopeError):
     """No space left while writing. What was there before is untouched."""
 
 
+class WorkerDied(DopeError):
+    """A process that works for this one was killed, e.g. by a lack of memory: it may go well the next time."""
+
+
 def _rebuild(cls: type[DopeError], what: str, where: str | None, remedy: str | None) -> DopeError:
     return cls(what, where=where, remedy=remedy)

@@ -16,9 +16,11 @@ from dope import checkpoints
 from dope.checkpoints import (
     best_pck,
     find_checkpoint,
+    go_on_from,
     latest_checkpoint,
     list_checkpoints,
     load_network,
+    note_origin,
     read_checkpoint,
     resume,
     resume_newest,
@@ -388,3 +390,81 @@ def test_a_setting_younger_than_the_checkpoint_had_its_defaults_effect(run: Path
 def test_other_shards_are_refused(run: Path) -> None:
     with pytest.raises(UsageError, match="other shards"):
         resume(run, new_state(CONFIG, ALONE), CONFIG, "others")
+
+
+def goes_on(how: str | Path, run: Path) -> int:
+    """As a run does: from where, and a note of it. Returns the step."""
+    state = new_state(CONFIG, ALONE)
+    found, _ = go_on_from(how, run, state, CONFIG, "shards")
+    note_origin(how, run, found)
+    return state.step
+
+
+def test_a_requeued_job_that_names_a_checkpoint_of_another_run_goes_on_where_it_was(tmp_path: Path) -> None:
+    given = save_checkpoint(tmp_path / "old", at(3), CONFIG, "shards")
+    run = tmp_path / "run"
+    assert [goes_on(given, run), goes_on(given, run)] == [3, 3]  # killed before it wrote one of its own
+    save_checkpoint(run, at(5), CONFIG, "shards")
+    given.unlink()
+    assert [goes_on(given, run), goes_on("auto", run)] == [5, 5]
+    other = save_checkpoint(tmp_path / "other", at(9), CONFIG, "shards")
+    with pytest.raises(UsageError, match=r"already holds a run \(step-00000005\.pt\)"):
+        goes_on(other, run)
+
+
+def test_going_back_within_a_run_lasts(tmp_path: Path) -> None:
+    early, _ = (save_checkpoint(tmp_path, at(step), keeping(keep=0), "shards") for step in (2, 8))
+    assert goes_on(early, tmp_path) == 2
+    assert [goes_on("auto", tmp_path), goes_on(early, tmp_path)] == [2, 2]  # killed before its first own one
+    save_checkpoint(tmp_path, at(4), keeping(keep=0), "shards")
+    assert [goes_on("auto", tmp_path), goes_on(early, tmp_path)] == [4, 4]
+    (tmp_path / "checkpoints/origin").unlink()
+    assert goes_on(early, tmp_path) == 2
+
+
+def test_a_restart_goes_on_in_the_new_folder_it_insisted_on_but_not_in_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "one")
+    assert goes_on("never", tmp_path) == 0
+    save_checkpoint(tmp_path, at(4), CONFIG, "shards")
+    with pytest.raises(UsageError, match="already holds a run"):
+        goes_on("never", tmp_path)
+    monkeypatch.setenv("TORCHELASTIC_RESTART_COUNT", "1")
+    assert goes_on("never", tmp_path) == 4
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "two")  # torchrun starts again what was refused at first
+    with pytest.raises(UsageError, match="already holds a run"):
+        goes_on("never", tmp_path)
+
+
+def parts(*without: str, **other: Any) -> Callable[[Path], None]:
+    """Writes a checkpoint without some of its parts, and others changed."""
+
+    def damage(path: Path) -> None:
+        values = {**torch.load(path, weights_only=True), **other}
+        torch.save({name: value for name, value in values.items() if name not in without}, path)
+        path.with_name(path.name + ".sha256").unlink()
+
+    return damage
+
+
+def hash_that_is_no_text(path: Path) -> None:
+    path.with_name(path.name + ".sha256").write_bytes(b"\xff\xfe\x80")
+
+
+@pytest.mark.parametrize(
+    ("damage", "what"),
+    [
+        (hash_that_is_no_text, "is damaged: its SHA-256 is not the one in"),
+        (parts("config", "momentum"), "lacks momentum, config"),
+        (parts(config=[1]), "has settings that are none"),
+        (parts(network={}), "does not fit the network of its settings"),
+        (parts(optimiser={"state": {}, "param_groups": []}), "does not fit the network"),
+        (parts(format=2, versions=[]), "was written by dope unknown in format 2"),
+    ],
+)
+def test_what_only_looks_like_a_checkpoint_is_explained(run: Path, damage: Callable[[Path], None], what: str) -> None:
+    (path,) = list_checkpoints(run)
+    damage(path)
+    with pytest.raises((BadInput, UsageError), match=rf"step-00000002\.pt: {what}"):
+        resume(run, new_state(CONFIG, ALONE), CONFIG, "shards")

@@ -156,9 +156,12 @@ def test_where_too_many_are_damaged_a_checkpoint_keeps_what_was_learnt(copy: Pat
 
 
 def test_a_share_that_is_damaged_as_a_whole_stops_a_run(copy: Path, tmp_path: Path) -> None:
+    train(copy, tmp_path / "run", tiny("data.max_bad_samples=100"), stop_after=1)
+    list_checkpoints(tmp_path / "run")[0].rename(given := tmp_path / "given.pt")
     damage(copy, *range(8))
-    with pytest.raises(BadInput, match=r"all 4 samples of rank 0 at step 0 are damaged.*1\.jpg cannot be decoded"):
-        train(copy, tmp_path / "run", tiny("data.max_bad_samples=100"))
+    with pytest.raises(BadInput, match=r"all 4 samples of rank 0 at step 1 are damaged.*1\.jpg cannot be decoded"):
+        train(copy, tmp_path / "new", tiny("data.max_bad_samples=100"), resume=given)
+    assert read_checkpoint(tmp_path / "new")["step"] == 1, "nothing is lost"
 
 
 def test_held_out_pairs_count_too_and_are_left_out(copy: Path, tmp_path: Path) -> None:

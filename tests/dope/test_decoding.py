@@ -117,3 +117,26 @@ def test_a_member_that_is_missing_or_damaged_is_named(name: str) -> None:
     del members[name]
     with pytest.raises(BadInput, match=rf"x: has no {name}"):
         decode(members, 64)
+
+
+HEAD = b"\x93NUMPY\x01\x00v\x00{'descr': '<f4', 'fortran_order': False, 'shape': (%s, 4), }"
+
+
+@pytest.mark.parametrize(
+    "head", [HEAD % b"3'", HEAD % b"01", HEAD % b"9999999999999", HEAD % (b"9" * 30), HEAD.replace(b"}", b" ") % b"3"]
+)
+def test_a_damaged_head_of_an_array_is_a_damaged_sample_whatever_python_makes_of_it(head: bytes) -> None:
+    data = head.ljust(127) + b"\n" + bytes(48)
+    with pytest.raises(BadInput, match=r"x: corr\.npy cannot be read"):
+        decode_points(data, 100, "x")
+
+
+def test_a_jpeg_whose_end_is_missing_is_damaged_though_it_can_be_decoded() -> None:
+    members = members_of(64)
+    whole = members["1.jpg"]
+    half = len(whole) // 2
+    data = whole[:half] + bytes(len(whole) - half)  # a hole that a broken copy left
+    assert decode_jpeg(data, 64)[0] is not None, "else nothing is shown"
+    with pytest.raises(BadInput, match=r"x: 1\.jpg is cut off"):
+        decode({**members, "1.jpg": data}, 64)
+    decode({**members, "1.jpg": whole + bytes(7)}, 64)

@@ -194,20 +194,25 @@ def rank_processes(run: Path) -> dict[int, int]:
 
 
 @pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="looks for the ranks in /proc")
-def test_a_killed_rank_leads_to_a_restart_that_finishes_the_job(shards: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("launcher", ["--nproc", "torchrun"])
+def test_a_killed_rank_leads_to_a_restart_that_finishes_the_job(shards: Path, tmp_path: Path, launcher: str) -> None:
     settings = [
         *many_ranks.SETTINGS, "data.batch_size=4", "data.pairs_per_object=1", "data.workers=0", "schedule.epochs=30",
         "validation.every=0", "checkpoint.every=2", "checkpoint.keep=2", "log.every=1",
     ]  # fmt: skip
-    command = [sys.executable, "-m", "cli", "train", str(shards), "--out", str(tmp_path), "--preset", "nano"]
-    # --resume never: a restart must go on all the same
-    command += ["--nproc", "2", "--max-restarts", "1", "--resume", "never", *as_flags(settings)]
+    train = ["-m", "cli", "train", str(shards), "--out", str(tmp_path), "--preset", "nano"]
+    train += ["--resume", "never", *as_flags(settings)]  # a restart must go on all the same
+    if launcher == "--nproc":
+        command = [sys.executable, *train, "--nproc", "2", "--max-restarts", "1"]
+    else:
+        command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+        command += ["--max-restarts", "1", *train]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment(), start_new_session=True)
     try:
         while process.poll() is None and not list_checkpoints(tmp_path):
             time.sleep(0.02)
         os.kill(rank_processes(tmp_path)[1], signal.SIGKILL)
-        _, errors = process.communicate(timeout=120)
+        _, errors = process.communicate(timeout=240)
     finally:
         process.terminate()
     assert process.returncode == 0, errors

@@ -25,7 +25,7 @@ def own_handlers() -> Iterator[None]:
 
 
 def test_they_are_the_batch_systems_and_the_terminals() -> None:
-    assert set(STOP_SIGNALS) == {signal.SIGTERM, signal.SIGUSR1, signal.SIGINT}
+    assert set(STOP_SIGNALS) == {signal.SIGTERM, signal.SIGUSR1, signal.SIGINT, signal.SIGHUP}
 
 
 @pytest.mark.parametrize("number", STOP_SIGNALS)
@@ -52,3 +52,10 @@ def test_a_second_ctrl_c_does_not_wait() -> None:
             os.kill(os.getpid(), signal.SIGINT)
     with pytest.raises(Untouched, match="SIGTERM"):
         os.kill(os.getpid(), signal.SIGTERM)
+
+
+def test_nohup_stays_in_force() -> None:
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    with StopRequest() as stop:
+        os.kill(os.getpid(), signal.SIGHUP)
+        assert not stop.requested

@@ -13,6 +13,7 @@ import pytest
 import torch
 from tiny_shards import make_pair, write_shards
 
+from dope import commands
 from dope.common.errors import BadInput, DopeError
 from dope.shard_index import read_index, verify_hashes
 from dope.streaming import PairDataset, PairLoader, collate
@@ -174,9 +175,36 @@ def no_shards_listed(folder: Path) -> None:
     (folder / "dataset.json").write_text(json.dumps({"counts": {}}))
 
 
+def manifest_of_another_kind(folder: Path) -> None:
+    (folder / "dataset.json").write_text("[]")
+
+
+def size_that_is_none(folder: Path) -> None:
+    path = folder / "dataset.json"
+    manifest = json.loads(path.read_text())
+    manifest["shards"]["train-000001.tar"]["bytes"] = "many"
+    path.write_text(json.dumps(manifest))
+
+
+def column(name: str, values: list[object]) -> Callable[[Path], None]:
+    def damage(folder: Path) -> None:
+        forget_hashes(folder)
+        table = pq.read_table(folder / "index.parquet")
+        of = pa.array([values[i % len(values)] for i in range(len(table))])
+        table = table.set_column(table.schema.get_field_index(name), name, of)
+        pq.write_table(table, folder / "index.parquet")
+
+    return damage
+
+
 @pytest.mark.parametrize(
     ("damage", "file", "what"),
     [
+        (manifest_of_another_kind, "dataset.json", "lists no shards"),
+        (size_that_is_none, "dataset.json", "lists no shards"),
+        (column("offset", ["a"]), "index.parquet", "values of another kind"),
+        (column("split", [1]), "index.parquet", "values of another kind"),
+        (column("n_correspondences", [None, 3]), "index.parquet", "has rows without n_correspondences"),
         (cut, "train-000001.tar", "cut off"),
         (remove, "train-000001.tar", "missing"),
         (exchange, "train-000000.tar", "another dataset|cut off"),
@@ -273,3 +301,16 @@ def test_the_helper_is_deterministic_and_stock_webdataset_reads_it(shards: Path,
     stock = webdataset.WebDataset(str(shards / "train-000000.tar"), shardshuffle=False)
     assert [sample["__key__"] for sample in stock] == list(read_index(shards, "train").keys[:10])
     subprocess.run(["tar", "tf", str(shards / "val-000000.tar")], check=True, capture_output=True)
+
+
+def test_changed_bytes_that_can_be_decoded_are_found_on_request(copy: Path, tmp_path: Path) -> None:
+    row = PairDataset(copy, "train", image_size=64).index.location(3)
+    path = copy / row.shard
+    data = bytearray(path.read_bytes())
+    place = data.index(b"NUMPY", row.offset) + 200  # within the points
+    data[place] ^= 1
+    path.write_bytes(data)
+    assert len(PairDataset(copy, "train", image_size=64)[3].points), "else nothing is shown"
+    with pytest.raises(BadInput, match=f"{row.shard}: its SHA-256 is not the one in dataset.json"):
+        commands.train(str(copy), tmp_path / "run", preset="nano", verify_shards=True)
+    assert not (tmp_path / "run").exists()
