@@ -1,0 +1,296 @@
+"""Wavefront OBJ files and their materials (MTL)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dope.common.errors import BadInput
+from pipeline.geometry import Floats
+from pipeline.render.mesh_files.beside import beside, decode_texture, read_beside
+from pipeline.render.mesh_files.text import (
+    colours_01,
+    damaged,
+    floats,
+    integers,
+    read,
+    require_faces,
+    require_indices,
+)
+from pipeline.render.mesh_files.triangulate import triangulate
+from pipeline.render.scene import Part
+
+LIBRARY = re.compile(rb"^[ \t]*mtllib[ \t]+(.+?)[ \t]*\r?$", re.MULTILINE)
+MAP_OPTIONS = {"-blendu": 1, "-blendv": 1, "-boost": 1, "-cc": 1, "-clamp": 1, "-imfchan": 1, "-texres": 1, "-type": 1,
+               "-bm": 1, "-mm": 2, "-o": 3, "-s": 3, "-t": 3}  # fmt: skip
+"""Options before the file's name in `map_Kd`, and how many words follow each (at most, for -o, -s, -t)."""
+
+
+@dataclass(frozen=True)
+class Material:
+    """Diffuse colour and the name of its picture."""
+
+    colour: tuple[float, float, float] | None = None
+    texture: str | None = None
+
+
+@dataclass
+class Lines:
+    """The lines of an OBJ file by what they are."""
+
+    v: list[list[bytes]]
+    vt: list[list[bytes]]
+    vn: list[list[bytes]]
+    faces: list[list[bytes]]
+    materials: list[tuple[int, str]]
+    """From which face on which material is in use."""
+
+
+def read_obj(path: Path, max_faces: int) -> list[Part]:
+    """The mesh of an OBJ file, a part for each material: its normals, texture coordinates and colours of vertices.
+
+    A material that the library does not have, or a library that is absent, is none: its faces get no look.
+
+    Raises:
+        BadInput: it is cut off, refers to vertices that it lacks, has too many faces, refers to files outside its
+            folder, or a texture of a material in use is missing.
+    """
+    data = read(path, max_faces)
+    lines = _lines(data, path)
+    require_faces(len(lines.faces), max_faces, path)
+    xyz, colours = _vertices(lines.v, path)
+    uv, vn = _table(lines.vt, 2, path), _table(lines.vn, 3, path)
+    sizes = np.fromiter(map(len, lines.faces), np.int64) - 1
+    if sizes.min() < 3:
+        raise damaged(path, "a face has fewer than three corners")
+    refs = _corners([row[1:] for row in lines.faces], path)
+    for k, count in enumerate((len(xyz), len(uv), len(vn))):
+        used = refs[:, k] if k == 0 else refs[refs[:, k] >= 0, k]
+        require_indices(used, count, path)
+    cut, owner = triangulate(xyz[refs[:, 0]], sizes, path)
+    require_faces(len(cut), max_faces, path)
+    library = read_materials(path, data)
+    textures: dict[str, NDArray[np.uint8]] = {}
+    parts = []
+    for name, faces in _by_material(lines.materials, owner):
+        material = library.get(name, Material())
+        part = _part(cut[faces], refs, xyz, colours, uv, vn, material)
+        if material.texture is not None and part.uv is not None:
+            if material.texture not in textures:
+                picture = read_beside(path, material.texture, "texture")
+                textures[material.texture] = decode_texture(picture, path, material.texture)
+            part = Part(
+                part.vertices, part.faces, part.normals, part.uv, None, textures[material.texture], (1.0, 1.0, 1.0)
+            )
+        parts.append(part)
+    return parts
+
+
+def _lines(data: bytes, path: Path) -> Lines:
+    lines = Lines([], [], [], [], [])
+    lists = {b"v": lines.v, b"vt": lines.vt, b"vn": lines.vn}
+    if b"\\" in data:  # a line that goes on
+        data = re.sub(rb"\\\r?\n", b" ", data)
+    for line in data.splitlines():
+        words = line.split()
+        if not words:
+            continue
+        kind = words[0]
+        if kind in lists:
+            lists[kind].append(words)
+        elif kind == b"f":
+            if b"#" in line:
+                words = line.partition(b"#")[0].split()
+            if b"-" in line:
+                words = [kind, *(_absolute(word, lines, path) for word in words[1:])]
+            lines.faces.append(words)
+        elif kind == b"usemtl":
+            name = line.split(None, 1)[1] if len(words) > 1 else b""
+            lines.materials.append((len(lines.faces), name.strip().decode(errors="surrogateescape")))
+    return lines
+
+
+def _absolute(word: bytes, lines: Lines, path: Path) -> bytes:
+    """A corner whose negative numbers count back from the last line before the face."""
+    counts = (len(lines.v), len(lines.vt), len(lines.vn))
+    numbers = word.split(b"/")
+    try:
+        return b"/".join(
+            b"%d" % (counts[k] + 1 + int(number)) if number.startswith(b"-") else number
+            for k, number in enumerate(numbers[:3])
+        )
+    except ValueError as error:
+        raise damaged(path, str(error)) from None
+
+
+def _vertices(rows: list[list[bytes]], path: Path) -> tuple[Floats, Floats | None]:
+    """(V, 3) positions, and (V, 3) colours where all lines have six numbers or more."""
+    if not rows:
+        raise BadInput("has no vertices", where=path, remedy="Export or download it again")
+    width = min(map(len, rows)) - 1
+    if width < 3:
+        raise damaged(path, "a vertex has fewer than three numbers")
+    take = 6 if width in (6, 7) else 3
+    table = floats((word for row in rows for word in row[1 : take + 1]), path).reshape(-1, take)
+    return np.ascontiguousarray(table[:, :3]), colours_01(table[:, 3:]) if take == 6 else None
+
+
+def _table(rows: list[list[bytes]], width: int, path: Path) -> Floats:
+    if not rows:
+        return np.empty((0, width))
+    if any(len(row) <= width for row in rows):
+        if width != 2:
+            raise damaged(path, "a normal has fewer than three numbers")
+        rows = [row if len(row) > 2 else [*row, b"0"] for row in rows]  # textures of one dimension
+        if any(len(row) <= width for row in rows):
+            raise damaged(path, "a texture coordinate has no numbers")
+    return floats((word for row in rows for word in row[1 : width + 1]), path).reshape(-1, width)
+
+
+def _corners(faces: list[list[bytes]], path: Path) -> NDArray[np.int64]:
+    """(N, 3) rows of vertices, texture coordinates and normals of all corners, from 0; -1 = none."""
+    words = [word for face in faces for word in face]
+    text = b" ".join(words)
+    slashes, twice = text.count(b"/"), text.count(b"//")
+    result = np.full((len(words), 3), -1, dtype=np.int64)
+    columns = None
+    if slashes == 0:
+        columns = [0]
+    elif slashes == len(words) * 2 and twice == len(words):
+        columns = [0, 2]
+    elif twice == 0 and slashes == len(words) and b"/ " not in text and not text.endswith(b"/"):
+        columns = [0, 1]
+    elif twice == 0 and slashes == 2 * len(words) and b"/ " not in text and not text.endswith(b"/"):
+        columns = [0, 1, 2]
+    if columns is not None:
+        numbers = integers(text.replace(b"/", b" ").split(), path)
+        if len(numbers) == len(words) * len(columns):
+            result[:, columns] = numbers.reshape(-1, len(columns)) - 1
+            if int(numbers.min()) < 1:
+                raise damaged(path, "a face refers to vertex 0 or below")
+            return result
+    for row, word in enumerate(words):
+        for k, number in enumerate(word.split(b"/")[:3]):
+            if number or k == 0:
+                try:
+                    result[row, k] = int(number) - 1
+                except (ValueError, OverflowError) as error:
+                    raise damaged(path, str(error)) from None
+                if result[row, k] < 0:
+                    raise damaged(path, "a face refers to vertex 0 or below")
+    return result
+
+
+def _by_material(changes: list[tuple[int, str]], owner: NDArray[np.int64]) -> Iterator[tuple[str, NDArray[np.int64]]]:
+    """The triangles of each material, in the order of first use."""
+    names: dict[str, int] = {}
+    starts = [0, *(face for face, _ in changes)]
+    numbers = [names.setdefault(name, len(names)) for name in ["", *(name for _, name in changes)]]
+    of_face = np.array(numbers)[np.searchsorted(starts, owner, side="right") - 1]
+    for name, number in names.items():
+        faces = np.nonzero(of_face == number)[0]
+        if len(faces):
+            yield name, faces
+
+
+def _part(
+    cut: NDArray[np.int64],
+    refs: NDArray[np.int64],
+    xyz: Floats,
+    colours: Floats | None,
+    uv: Floats,
+    vn: Floats,
+    material: Material,
+) -> Part:
+    """The triangles `cut` (rows of `refs`), with a vertex for each combination of position, coordinate and normal."""
+    used = refs[cut.ravel()]
+    has_uv, has_vn = bool((used[:, 1] >= 0).all()), bool((used[:, 2] >= 0).all())
+    combined = used[:, 0].copy()
+    for k, count, has in ((1, len(uv), has_uv), (2, len(vn), has_vn)):
+        if has:  # numbered anew each time: three counts multiplied may be too large for an integer
+            combined = np.unique(combined, return_inverse=True)[1] * count + used[:, k]
+    _, first, faces = np.unique(combined, return_index=True, return_inverse=True)
+    rows = used[first]
+    return Part(
+        xyz[rows[:, 0]],
+        faces.reshape(-1, 3),
+        vn[rows[:, 2]] if has_vn else None,
+        uv[rows[:, 1]] if has_uv else None,
+        None if colours is None else colours[rows[:, 0]],
+        None,
+        material.colour,
+    )
+
+
+def read_materials(path: Path, data: bytes) -> dict[str, Material]:
+    """The materials of the libraries that an OBJ file names. Those that are absent have none.
+
+    Raises:
+        BadInput: a library lies outside the mesh's folder.
+    """
+    materials: dict[str, Material] = {}
+    for library in libraries(path, data):
+        if library.is_file():
+            materials |= _read_library(library)
+    return materials
+
+
+def libraries(path: Path, data: bytes) -> list[Path]:
+    """The material libraries that an OBJ file names. Raises `BadInput` where one lies outside its folder."""
+    found: list[Path] = []
+    for match in LIBRARY.finditer(data):
+        whole = match[1].decode(errors="surrogateescape")
+        named = beside(path, whole)
+        names = [whole] if named.is_file() else whole.split()  # one name with spaces, or several names
+        found += [beside(path, name) for name in names]
+    return list(dict.fromkeys(found))
+
+
+def textures_of(materials: Iterable[Material]) -> list[str]:
+    """Names of the pictures."""
+    return list(dict.fromkeys(material.texture for material in materials if material.texture is not None))
+
+
+def _read_library(path: Path) -> dict[str, Material]:
+    try:
+        text = path.read_bytes().decode(errors="surrogateescape")
+    except OSError as error:
+        raise BadInput(f"cannot be read ({error.strerror})", where=path) from error
+    materials: dict[str, Material] = {}
+    name = None
+    for line in text.splitlines():
+        words = line.split()
+        if words[:1] == ["newmtl"]:
+            name = line.split(None, 1)[1].strip() if len(words) > 1 else ""
+            materials[name] = Material()
+        elif name is not None and words[:1] == ["Kd"]:
+            materials[name] = Material(_colour(words[1:4]), materials[name].texture)
+        elif name is not None and words and words[0].lower() == "map_kd" and (texture := _texture_name(line)):
+            materials[name] = Material(materials[name].colour, texture)
+    return materials
+
+
+def _colour(words: list[str]) -> tuple[float, float, float] | None:
+    try:
+        r, g, b = (min(max(float(word), 0.0), 1.0) for word in (words if len(words) == 3 else words[:1] * 3))
+    except ValueError:  # `Kd spectral file.rfl`, or none
+        return None
+    return r, g, b
+
+
+def _texture_name(line: str) -> str:
+    rest = line.split(None, 1)[1].strip() if len(line.split()) > 1 else ""
+    while rest.startswith("-"):
+        option, _, rest = rest.partition(" ")
+        for _ in range(MAP_OPTIONS.get(option.lower(), 1)):
+            word, _, after = rest.strip().partition(" ")
+            if option in ("-o", "-s", "-t") and not re.fullmatch(r"[-+.\deE]+", word):
+                break
+            rest = after
+        rest = rest.strip()
+    return rest
