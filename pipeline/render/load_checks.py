@@ -1,4 +1,4 @@
-"""What a mesh must be before it is rendered. Importers accept nearly anything in silence; the picture shows it later."""
+"""What a mesh must be before it is rendered. Importers accept nearly anything in silence; pictures show it."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ LARGEST_TEXTURE = 1024
 
 
 def home(mesh: Path) -> Path:
-    """The folder that a mesh may refer into: its own; in ShapeNetCore v2 the model's, where `images` is beside `models`."""
+    """The folder that a mesh may refer into: its own; in ShapeNetCore v2 the one that holds `images` and `models`."""
     folder = mesh.absolute().parent
     return folder.parent if folder.name == "models" and mesh.stem == "model_normalized" else folder
 
@@ -41,7 +41,7 @@ def beside(mesh: Path, name: str) -> Path:
 
 
 def read_beside(mesh: Path, name: str, kind: str) -> bytes:
-    """The bytes of a file that a mesh names; `kind` says in an error what it is. Raises `BadInput` where it is absent."""
+    """The bytes of a file that a mesh names; `kind` says what it is. Raises `BadInput` where it is absent."""
     path = beside(mesh, name)
     try:
         if not path.is_file():

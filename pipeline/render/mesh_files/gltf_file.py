@@ -100,7 +100,7 @@ class GltfFile:
             raise damaged(self.path, f"there is no {kind}[{index!s:.20}]")
         if not isinstance(entries[index], dict):
             raise damaged(self.path, f"{kind}[{index}] is no object")
-        return entries[index]  # type: ignore[no-any-return]
+        return entries[index]
 
     def count(self, accessor: int) -> int:
         """Elements that an accessor claims."""
@@ -205,6 +205,7 @@ class GltfFile:
         if index is None and "KHR_texture_basisu" in extensions:
             raise self.compressed("KHR_texture_basisu")
         image = self.item("images", index)
+        assert isinstance(index, int)
         if index not in self._pictures:
             if "uri" in image:
                 name = str(image["uri"]) if not str(image["uri"]).startswith("data:") else f"images[{index}]"

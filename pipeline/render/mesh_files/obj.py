@@ -39,14 +39,36 @@ class Material:
     texture: str | None = None
 
 
-@dataclass
-class Lines:
-    """The lines of an OBJ file by what they are."""
+@dataclass(frozen=True)
+class Words:
+    """Words of lines, one line after the other; a list a line would keep Python's garbage collector busy."""
 
-    v: list[list[bytes]]
-    vt: list[list[bytes]]
-    vn: list[list[bytes]]
-    faces: list[list[bytes]]
+    words: list[bytes]
+    sizes: NDArray[np.int64]
+    """(N,) of each line."""
+
+    @classmethod
+    def of(cls, lines: list[bytes]) -> Words:
+        sizes = np.fromiter([len(line.split()) for line in lines], np.int64)
+        return cls(b" ".join(lines).split(), sizes)
+
+    def numbers(self, width: int, path: Path) -> Floats:
+        """(N, `width`) the first numbers of each line, none of which is shorter."""
+        if len(self.words) == width * len(self.sizes):
+            return floats(self.words, path).reshape(-1, width)
+        starts = np.cumsum(self.sizes) - self.sizes
+        rows = (starts[:, None] + np.arange(width)).ravel().tolist()
+        return floats((self.words[row] for row in rows), path).reshape(-1, width)
+
+
+@dataclass(frozen=True)
+class Lines:
+    """The lines of an OBJ file by what they are, without the first word."""
+
+    v: Words
+    vt: Words
+    vn: Words
+    faces: Words
     materials: list[tuple[int, str]]
     """From which face on which material is in use."""
 
@@ -62,13 +84,13 @@ def read_obj(path: Path, max_faces: int) -> list[Part]:
     """
     data = read(path, max_faces)
     lines = _lines(data, path)
-    require_faces(len(lines.faces), max_faces, path)
+    sizes = lines.faces.sizes
+    require_faces(len(sizes), max_faces, path)
     xyz, colours = _vertices(lines.v, path)
     uv, vn = _table(lines.vt, 2, path), _table(lines.vn, 3, path)
-    sizes = np.fromiter(map(len, lines.faces), np.int64) - 1
     if sizes.min() < 3:
         raise damaged(path, "a face has fewer than three corners")
-    refs = _corners([row[1:] for row in lines.faces], path)
+    refs = _corners(lines.faces.words, path)
     for k, count in enumerate((len(xyz), len(uv), len(vn))):
         used = refs[:, k] if k == 0 else refs[refs[:, k] >= 0, k]
         require_indices(used, count, path)
@@ -92,32 +114,34 @@ def read_obj(path: Path, max_faces: int) -> list[Part]:
 
 
 def _lines(data: bytes, path: Path) -> Lines:
-    lines = Lines([], [], [], [], [])
-    lists = {b"v": lines.v, b"vt": lines.vt, b"vn": lines.vn}
+    v: list[bytes] = []
+    vt: list[bytes] = []
+    vn: list[bytes] = []
+    faces: list[bytes] = []
+    materials: list[tuple[int, str]] = []
+    lists = {b"v": v, b"vt": vt, b"vn": vn, b"f": faces}
     if b"\\" in data:  # a line that goes on
         data = re.sub(rb"\\\r?\n", b" ", data)
     for line in data.splitlines():
-        words = line.split()
-        if not words:
-            continue
-        kind = words[0]
-        if kind in lists:
-            lists[kind].append(words)
-        elif kind == b"f":
-            if b"#" in line:
-                words = line.partition(b"#")[0].split()
-            if b"-" in line:
-                words = [kind, *(_absolute(word, lines, path) for word in words[1:])]
-            lines.faces.append(words)
-        elif kind == b"usemtl":
-            name = line.split(None, 1)[1] if len(words) > 1 else b""
-            lines.materials.append((len(lines.faces), name.strip().decode(errors="surrogateescape")))
-    return lines
+        kind, _, rest = line.partition(b" ")
+        if kind not in lists:
+            words = line.split(None, 1)
+            if not words or words[0] not in lists and words[0] != b"usemtl":
+                continue
+            kind, rest = words[0], words[1] if len(words) > 1 else b""
+            if kind == b"usemtl":
+                materials.append((len(faces), rest.strip().decode(errors="surrogateescape")))
+                continue
+        if b"#" in rest:
+            rest = rest.partition(b"#")[0]
+        if kind == b"f" and b"-" in rest:
+            rest = b" ".join([_absolute(word, (len(v), len(vt), len(vn)), path) for word in rest.split()])
+        lists[kind].append(rest)
+    return Lines(Words.of(v), Words.of(vt), Words.of(vn), Words.of(faces), materials)
 
 
-def _absolute(word: bytes, lines: Lines, path: Path) -> bytes:
+def _absolute(word: bytes, counts: tuple[int, int, int], path: Path) -> bytes:
     """A corner whose negative numbers count back from the last line before the face."""
-    counts = (len(lines.v), len(lines.vt), len(lines.vn))
     numbers = word.split(b"/")
     try:
         return b"/".join(
@@ -128,33 +152,30 @@ def _absolute(word: bytes, lines: Lines, path: Path) -> bytes:
         raise damaged(path, str(error)) from None
 
 
-def _vertices(rows: list[list[bytes]], path: Path) -> tuple[Floats, Floats | None]:
+def _vertices(lines: Words, path: Path) -> tuple[Floats, Floats | None]:
     """(V, 3) positions, and (V, 3) colours where all lines have six numbers or more."""
-    if not rows:
+    if not len(lines.sizes):
         raise BadInput("has no vertices", where=path, remedy="Export or download it again")
-    width = min(map(len, rows)) - 1
-    if width < 3:
+    least = int(lines.sizes.min())
+    if least < 3:
         raise damaged(path, "a vertex has fewer than three numbers")
-    take = 6 if width in (6, 7) else 3
-    table = floats((word for row in rows for word in row[1 : take + 1]), path).reshape(-1, take)
-    return np.ascontiguousarray(table[:, :3]), colours_01(table[:, 3:]) if take == 6 else None
+    table = lines.numbers(6 if least in (6, 7) else 3, path)
+    return np.ascontiguousarray(table[:, :3]), colours_01(table[:, 3:]) if table.shape[1] == 6 else None
 
 
-def _table(rows: list[list[bytes]], width: int, path: Path) -> Floats:
-    if not rows:
+def _table(lines: Words, width: int, path: Path) -> Floats:
+    if not len(lines.sizes):
         return np.empty((0, width))
-    if any(len(row) <= width for row in rows):
-        if width != 2:
-            raise damaged(path, "a normal has fewer than three numbers")
-        rows = [row if len(row) > 2 else [*row, b"0"] for row in rows]  # textures of one dimension
-        if any(len(row) <= width for row in rows):
-            raise damaged(path, "a texture coordinate has no numbers")
-    return floats((word for row in rows for word in row[1 : width + 1]), path).reshape(-1, width)
+    least = int(lines.sizes.min())
+    if width == 2 and least == 1:  # textures of one dimension
+        return lines.numbers(1, path) * (1.0, 0.0)
+    if least < width:
+        raise damaged(path, "a normal or texture coordinate has too few numbers")
+    return lines.numbers(width, path)
 
 
-def _corners(faces: list[list[bytes]], path: Path) -> NDArray[np.int64]:
+def _corners(words: list[bytes], path: Path) -> NDArray[np.int64]:
     """(N, 3) rows of vertices, texture coordinates and normals of all corners, from 0; -1 = none."""
-    words = [word for face in faces for word in face]
     text = b" ".join(words)
     slashes, twice = text.count(b"/"), text.count(b"//")
     result = np.full((len(words), 3), -1, dtype=np.int64)
