@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry import Floats
+from pipeline.render.extra import missing
 
 Indices = NDArray[np.int64]
 CREASE_DEG = 32.0
@@ -44,8 +45,11 @@ def crease_normals(vertices: Floats, faces: Indices, crease_deg: float = CREASE_
     Returns:
         (V', ) the row of `vertices` that each new vertex repeats, (F, 3) faces of new vertices, (V', 3) unit normals.
     """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
+    try:
+        from scipy.sparse import coo_matrix
+        from scipy.sparse.csgraph import connected_components
+    except ImportError:
+        raise missing("scipy") from None
 
     places = weld(vertices)[1][faces]
     normals = face_normals(vertices, faces)

@@ -46,7 +46,10 @@ def load_model(path: Path, *, max_faces: int) -> Model:
     if reader is None:
         known = ", ".join(suffix[1:] for suffix in READERS)
         raise BadInput("is no mesh that can be read", where=path, remedy=f"Convert it to one of {known}")
-    parts = checked(reader(path, max_faces), path, max_faces)
+    try:
+        parts = checked(reader(path, max_faces), path, max_faces)
+    except OSError as error:  # of a file that it names: a name that is too long
+        raise BadInput(f"cannot be read ({error.strerror})", where=path) from error
     return Model(tuple(_finished(part) for part in parts))
 
 

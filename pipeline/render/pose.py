@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dope.common.errors import DopeError
 from pipeline.geometry import Floats
+from pipeline.render.extra import missing
 from pipeline.render.scene import Model
 
 TO_Z_UP = {
@@ -76,7 +76,7 @@ def resting_sides(vertices: Floats) -> tuple[Floats, Floats]:
     try:
         from scipy.spatial import ConvexHull, QhullError
     except ImportError:
-        raise DopeError("scipy is missing", remedy="pip install 'dope-descriptors[render]'") from None
+        raise missing("scipy") from None
     points = _outermost((vertices - vertices.mean(axis=0)) / np.ptp(vertices, axis=0).max())
     points = points - points.mean(axis=0)
     axes = np.linalg.eigh(points.T @ points)[1]

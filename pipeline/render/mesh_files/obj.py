@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
+from mmap import mmap
 from pathlib import Path
 
 import numpy as np
@@ -126,7 +127,7 @@ def _lines(data: bytes, path: Path) -> Lines:
         kind, _, rest = line.partition(b" ")
         if kind not in lists:
             words = line.split(None, 1)
-            if not words or words[0] not in lists and words[0] != b"usemtl":
+            if not words or (words[0] not in lists and words[0] != b"usemtl"):
                 continue
             kind, rest = words[0], words[1] if len(words) > 1 else b""
             if kind == b"usemtl":
@@ -255,29 +256,26 @@ def read_materials(path: Path, data: bytes) -> dict[str, Material]:
         BadInput: a library lies outside the mesh's folder.
     """
     materials: dict[str, Material] = {}
-    for library in libraries(path, data):
+    for name in library_names(path, data):
+        library = beside(path, name)
         if library.is_file():
-            materials |= _read_library(library)
+            materials |= read_library(library)
     return materials
 
 
-def libraries(path: Path, data: bytes) -> list[Path]:
-    """The material libraries that an OBJ file names. Raises `BadInput` where one lies outside its folder."""
-    found: list[Path] = []
+def library_names(path: Path, data: bytes | mmap) -> Iterator[str]:
+    """The material libraries that an OBJ file names."""
     for match in LIBRARY.finditer(data):
         whole = match[1].decode(errors="surrogateescape")
-        named = beside(path, whole)
-        names = [whole] if named.is_file() else whole.split()  # one name with spaces, or several names
-        found += [beside(path, name) for name in names]
-    return list(dict.fromkeys(found))
+        try:
+            single = len(whole.split()) < 2 or beside(path, whole).is_file()
+        except (BadInput, OSError):
+            single = False
+        yield from [whole] if single else whole.split()  # one name with spaces, or several names
 
 
-def textures_of(materials: Iterable[Material]) -> list[str]:
-    """Names of the pictures."""
-    return list(dict.fromkeys(material.texture for material in materials if material.texture is not None))
-
-
-def _read_library(path: Path) -> dict[str, Material]:
+def read_library(path: Path) -> dict[str, Material]:
+    """The materials of an MTL file. Raises `BadInput` where it cannot be read."""
     try:
         text = path.read_bytes().decode(errors="surrogateescape")
     except OSError as error:
