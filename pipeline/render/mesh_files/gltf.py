@@ -9,14 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dope.common.errors import BadInput
 from pipeline.geometry import Floats
 from pipeline.render.mesh_files.gltf_file import GltfFile, Json
-from pipeline.render.mesh_files.text import damaged, read, require_faces, require_indices
+from pipeline.render.mesh_files.text import damaged, read, require_faces, require_indices, simplify
 from pipeline.render.scene import Part
 
 TRIANGLES, STRIP, FAN = 4, 5, 6
-MOST_NODES = 100_000
-"""That are visited: a file in which nodes share their children may spell out far more than it holds."""
+MOST_NODES, DEEPEST = 100_000, 1000
+"""That are visited, and one below the other: nodes that share their children spell out far more than a file holds."""
+SPARE = 4
+"""Most vertices a face of the most faces: triangles use three at most."""
 
 
 def read_gltf(path: Path, max_faces: int) -> list[Part]:
@@ -27,29 +30,37 @@ def read_gltf(path: Path, max_faces: int) -> list[Part]:
             missing, or has too many faces.
     """
     file = GltfFile(path, read(path, max_faces))
+    with np.errstate(all="ignore"):  # what is not finite is refused later
+        return _read(file, max_faces)
+
+
+def _read(file: GltfFile, max_faces: int) -> list[Part]:
     try:
         placed = [(primitive, matrix) for mesh, matrix in _placed(file) for primitive in _primitives(file, mesh)]
-        require_faces(sum(_claimed(file, primitive) for primitive, _ in placed), max_faces, path)
+        require_faces(sum(_claimed(file, primitive) for primitive, _ in placed), max_faces, file.path)
+        vertices = sum(file.count(primitive["attributes"]["POSITION"]) for primitive, _ in placed)
+        if vertices > SPARE * max_faces:  # one that is used by many nodes counts for each
+            what = f"spells out {vertices} vertices, more than {SPARE} a face"
+            raise BadInput(what, where=file.path, remedy=simplify(max_faces))
         return [_part(file, primitive, matrix) for primitive, matrix in placed]
     except (TypeError, ValueError, KeyError, AttributeError, IndexError, OverflowError) as error:
-        raise damaged(path, f"its JSON is not as glTF 2.0 asks ({error})") from error
+        raise damaged(file.path, f"its JSON is not as glTF 2.0 asks ({error})") from error
 
 
 def _placed(file: GltfFile) -> Iterator[tuple[Json, Floats]]:
     """Meshes of the scene with (4, 4) transforms to the file's world."""
     visited = 0
-    stack = [(node, np.eye(4), frozenset[int]()) for node in reversed(_roots(file))]
+    stack = [(node, np.eye(4), 0) for node in reversed(_roots(file))]
     while stack:
-        index, above, ancestors = stack.pop()
+        index, above, depth = stack.pop()
         node = file.item("nodes", index)
         visited += 1
-        if index in ancestors or visited > MOST_NODES:
+        if depth > DEEPEST or visited > MOST_NODES:
             raise damaged(file.path, "its nodes run in a circle, or are too many")
         matrix = above @ _matrix(node)
         if "mesh" in node:
             yield file.item("meshes", node["mesh"]), (np.eye(4) if "skin" in node else matrix)
-        below = ancestors | {index}
-        stack += [(child, matrix, below) for child in reversed(node.get("children", []))]
+        stack += [(child, matrix, depth + 1) for child in reversed(node.get("children", []))]
 
 
 def _roots(file: GltfFile) -> list[int]:
@@ -98,8 +109,7 @@ def _part(file: GltfFile, primitive: Json, matrix: Floats) -> Part:
     attributes = primitive["attributes"]
     vertices = file.floats(attributes["POSITION"], 3)
     faces = _faces(file, primitive, len(vertices))
-    with np.errstate(all="ignore"):  # what is not finite is refused later
-        vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+    vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
     normals = _attribute(file, attributes, "NORMAL", 3, len(vertices))
     if normals is not None:
         normals = normals @ _cofactors(matrix[:3, :3]).T

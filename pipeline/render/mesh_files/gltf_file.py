@@ -31,6 +31,8 @@ COMPRESSED = {
 }
 READ = frozenset({"KHR_texture_transform", "KHR_mesh_quantization", "EXT_texture_webp", "KHR_lights_punctual"})
 """Extensions that a file may require, besides those of materials: the others would change the shape."""
+MOST_ZEROS = 1 << 22
+"""Elements of an accessor without bytes, which stands for zeros."""
 GLB_JSON, GLB_BINARY = 0x4E4F534A, 0x004E4942
 
 Json = dict[str, Any]
@@ -64,7 +66,7 @@ class GltfFile:
                     raise damaged(self.path, "a chunk is not whole")
                 chunk = data[at + 8 : at + 8 + size]
                 if kind == GLB_JSON and not text:
-                    text = chunk
+                    text = chunk.rstrip(b"\0")  # spaces would be right
                 elif kind == GLB_BINARY and self.binary is None:
                     self.binary = chunk
                 at += 8 + size
@@ -160,8 +162,10 @@ class GltfFile:
         if "bufferView" in accessor:
             offset = self.whole(accessor.get("byteOffset", 0))
             values = self._strided(accessor["bufferView"], offset, dtype, count, width)
-        else:
+        elif count <= MOST_ZEROS:
             values = np.zeros((count, width), dtype)
+        else:
+            raise damaged(self.path, f"an accessor claims {count!s:.20} elements without holding any")
         if isinstance(sparse := accessor.get("sparse"), dict):
             values = self._with_sparse(values, sparse, dtype)
         if accessor.get("normalized") is True and dtype[1] != "f":

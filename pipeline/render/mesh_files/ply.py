@@ -72,7 +72,9 @@ def read_ply_mesh(path: Path, max_faces: int) -> list[Part]:
     xyz, corners = _together(vertex, "xyz"), next((face[name] for name in CORNER_NAMES if name in face), None)
     if xyz is None or not isinstance(corners, Lists):
         raise BadInput("is a PLY file without vertices or faces", where=path)
-    flat = corners.values.astype(np.int64)
+    if not np.isfinite(corners.values).all():  # indices may be floats
+        raise damaged(path, "an index is not finite")
+    flat = np.clip(corners.values, -1, 1 << 40).astype(np.int64)
     require_indices(flat, len(xyz), path)
     normals, colours = _together(vertex, ("nx", "ny", "nz")), _colours(vertex)
     uv = next((uv for names in UV_NAMES if (uv := _together(vertex, names)) is not None), None)

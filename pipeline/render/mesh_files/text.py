@@ -22,6 +22,8 @@ def read(path: Path, max_faces: int) -> bytes:
         size, most = path.stat().st_size, ROOM + BYTES_A_FACE * max_faces
         if size > most:
             raise BadInput(f"is huge ({size >> 20} MiB, at most {most >> 20})", where=path, remedy=simplify(max_faces))
+        if not size:
+            raise BadInput("is an empty file", where=path, remedy=WRITE_AGAIN)
         return path.read_bytes()
     except OSError as error:
         raise BadInput(f"cannot be read ({error.strerror})", where=path) from error
