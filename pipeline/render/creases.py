@@ -12,6 +12,9 @@ Indices = NDArray[np.int64]
 CREASE_DEG = 32.0
 """Edges that turn by more stay sharp: a prism of twelve sides is meant to be round, one of eight is not."""
 
+SHARP_DEG, FEW, SAME = 60.0, 0.02, 0.999
+"""Of `go_round_sharp_edges`: what is sharp, which share of edges is few, and the cosine between equal normals."""
+
 
 def weld(vertices: Floats) -> tuple[Indices, Indices]:
     """Vertices at exactly the same place: (W,) a row for each place, and (V,) the number of each vertex's place."""
@@ -52,16 +55,9 @@ def crease_normals(vertices: Floats, faces: Indices, crease_deg: float = CREASE_
         raise missing("scipy") from None
 
     places = weld(vertices)[1][faces]
-    normals = face_normals(vertices, faces)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    start, end = places.ravel(), np.roll(places, -1, axis=1).ravel()  # half-edge 3 f + k begins at corner 3 f + k
-    key = np.minimum(start, end) * (places.max() + 1) + np.maximum(start, end)
-    order = np.argsort(key, kind="stable")
-    same = np.concatenate([[False], key[order[1:]] == key[order[:-1]], [False]])  # as the one before
-    two = np.nonzero(same[1:-1] & ~same[:-2] & ~same[2:])[0]
-    one, other = order[two], order[two + 1]
+    normals = _unit_face_normals(vertices, faces)
+    one, other = _shared_edges(places)
     gentle = (normals[one // 3] * normals[other // 3]).sum(axis=1) >= np.cos(np.radians(crease_deg))
-    gentle &= start[one] == end[other]
     one, other = one[gentle], other[gentle]
     rows = np.concatenate([one, _next(one)])
     columns = np.concatenate([_next(other), other])
@@ -80,6 +76,40 @@ def crease_normals(vertices: Floats, faces: Indices, crease_deg: float = CREASE_
     lost = ~result.any(axis=1)
     result[lost] = normals[first[lost] // 3]
     return new % len(vertices), new_faces.reshape(-1, 3), result
+
+
+def go_round_sharp_edges(vertices: Floats, faces: Indices, normals: Floats) -> bool:
+    """Whether unit normals at vertices are means over all faces there, sharp edges or not, as MeshLab writes them.
+
+    Cubes shaded with those look like balloons. Who means his normals splits them at sharp edges, at some at least.
+    """
+    of_faces = _unit_face_normals(vertices, faces)
+    one, other = _shared_edges(weld(vertices)[1][faces])
+    sharp = (of_faces[one // 3] * of_faces[other // 3]).sum(axis=1) < np.cos(np.radians(SHARP_DEG))
+    if not len(one) or sharp.mean() < FEW:
+        return False
+    one, other = one[sharp], other[sharp]
+    corners = normals[faces.ravel()]
+    same = (corners[one] * corners[_next(other)]).sum(axis=1) > SAME
+    same &= (corners[_next(one)] * corners[other]).sum(axis=1) > SAME
+    return bool(same.mean() > 1 - FEW)
+
+
+def _unit_face_normals(vertices: Floats, faces: Indices) -> Floats:
+    normals = face_normals(vertices, faces)
+    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def _shared_edges(places: Indices) -> tuple[Indices, Indices]:
+    """Both half-edges of each edge of two faces that are wound alike; half-edge 3 f + k starts at corner k of f."""
+    start, end = places.ravel(), np.roll(places, -1, axis=1).ravel()
+    key = np.minimum(start, end) * (places.max() + 1) + np.maximum(start, end)
+    order = np.argsort(key, kind="stable")
+    same = np.concatenate([[False], key[order[1:]] == key[order[:-1]], [False]])  # as the one before
+    two = np.nonzero(same[1:-1] & ~same[:-2] & ~same[2:])[0]
+    one, other = order[two], order[two + 1]
+    alike = start[one] == end[other]
+    return one[alike], other[alike]
 
 
 def corner_angles(vertices: Floats, faces: Indices) -> Floats:

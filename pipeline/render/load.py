@@ -9,7 +9,7 @@ import numpy as np
 
 from dope.common.errors import BadInput
 from pipeline.geometry import Floats
-from pipeline.render.creases import crease_normals
+from pipeline.render.creases import crease_normals, go_round_sharp_edges
 from pipeline.render.load_checks import checked
 from pipeline.render.mesh_files.gltf import read_gltf
 from pipeline.render.mesh_files.obj import read_obj
@@ -33,7 +33,8 @@ def load_model(path: Path, *, max_faces: int) -> Model:
     """The mesh of a file, in the file's own frame and units, a part for each material.
 
     Polygons are cut into triangles; degenerate triangles, and those that lie on one another, are left out. Normals are
-    the file's where all of them can be used, else smooth up to creases (`crease_normals`); vertices are split there.
+    the file's where all of them can be used and they are not mere means over sharp edges, else smooth up to creases
+    (`crease_normals`); vertices are split there.
 
     Args:
         path: an OFF, OBJ, PLY, STL, GLB or glTF file.
@@ -56,7 +57,7 @@ def load_model(path: Path, *, max_faces: int) -> Model:
 def _finished(part: Part) -> Part:
     normals = _usable(part.normals)
     vertices, faces, rows = part.vertices, part.faces, None
-    if normals is None:
+    if normals is None or go_round_sharp_edges(vertices, faces, normals):
         rows, faces, normals = crease_normals(vertices, faces)
         vertices = vertices[rows]
     uv = part.uv

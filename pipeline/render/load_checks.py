@@ -27,6 +27,8 @@ THIN = 1e-12
 def checked(parts: list[Part], path: Path, max_faces: int) -> list[Part]:
     """The parts without degenerate and repeated triangles, and without vertices that no triangle uses.
 
+    An object that is wound inside out is turned over.
+
     Raises:
         BadInput: no faces, too many, not finite, of an absurd extent, or without area.
     """
@@ -39,12 +41,21 @@ def checked(parts: list[Part], path: Path, max_faces: int) -> list[Part]:
     kept = _worth_keeping(vertices, faces)
     if not kept.any():
         raise BadInput("has no area: all its triangles are degenerate", where=path, remedy=WRITE_AGAIN)
-    ends = np.cumsum([len(part.faces) for part in parts])[:-1]
-    if kept.all():
-        return parts
-    masks = np.split(kept, ends)
+    inside_out = _signed_volume(vertices, faces[kept]) < 0
+    masks = np.split(kept, np.cumsum([len(part.faces) for part in parts])[:-1])
     thinned = [replace(part, faces=part.faces[mask]) for part, mask in zip(parts, masks, strict=True) if mask.any()]
-    return [_compact(part) for part in thinned]
+    return [_compact(_turned_over(part) if inside_out else part) for part in thinned]
+
+
+def _signed_volume(vertices: Floats, faces: NDArray[np.int64]) -> float:
+    """Six times the volume inside, negative where the faces are wound clockwise from outside."""
+    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2  # of open surfaces the volume depends on it
+    a, b, c = (vertices[faces[:, k]] - middle for k in range(3))
+    return float((a * np.cross(b, c)).sum())
+
+
+def _turned_over(part: Part) -> Part:
+    return replace(part, faces=part.faces[:, ::-1].copy(), normals=None if part.normals is None else -part.normals)
 
 
 def _compact(part: Part) -> Part:

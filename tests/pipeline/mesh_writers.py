@@ -26,7 +26,7 @@ def write(path: Path, data: str | bytes) -> Path:
 
 
 def lines(rows: Any, before: str = "", after: str = "") -> str:
-    return "".join(before + " ".join(f"{value:g}" for value in row) + after + "\n" for row in rows)
+    return "".join(before + " ".join(f"{value:.17g}" for value in row) + after + "\n" for row in rows)
 
 
 def off(head: str = "OFF\n8 6 12\n", quads: Any = QUADS) -> str:

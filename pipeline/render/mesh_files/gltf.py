@@ -16,7 +16,7 @@ from pipeline.render.mesh_files.text import damaged, read, require_faces, requir
 from pipeline.render.scene import Part
 
 TRIANGLES, STRIP, FAN = 4, 5, 6
-MOST_NODES, DEEPEST = 100_000, 1000
+MOST_NODES, DEEPEST = 10_000, 1000
 """That are visited, and one below the other: nodes that share their children spell out far more than a file holds."""
 SPARE = 4
 """Most vertices a face of the most faces: triangles use three at most."""

@@ -15,6 +15,7 @@ from dope.common.errors import BadInput
 from pipeline.geometry import Floats
 from pipeline.render.mesh_files.beside import beside, decode_texture, read_beside
 from pipeline.render.mesh_files.text import (
+    WRITE_AGAIN,
     colours_01,
     damaged,
     floats,
@@ -156,7 +157,7 @@ def _absolute(word: bytes, counts: tuple[int, int, int], path: Path) -> bytes:
 def _vertices(lines: Words, path: Path) -> tuple[Floats, Floats | None]:
     """(V, 3) positions, and (V, 3) colours where all lines have six numbers or more."""
     if not len(lines.sizes):
-        raise BadInput("has no vertices", where=path, remedy="Export or download it again")
+        raise BadInput("has no vertices", where=path, remedy=WRITE_AGAIN)
     least = int(lines.sizes.min())
     if least < 3:
         raise damaged(path, "a vertex has fewer than three numbers")

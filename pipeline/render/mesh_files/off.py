@@ -9,6 +9,7 @@ import numpy as np
 
 from dope.common.errors import BadInput
 from pipeline.render.mesh_files.text import (
+    WRITE_AGAIN,
     colours_01,
     damaged,
     floats,
@@ -32,7 +33,7 @@ def read_off(path: Path, max_faces: int) -> list[Part]:
     data = read(path, max_faces)
     head = HEAD.match(data)
     if head is None:
-        raise BadInput("is not an OFF file", where=path)
+        raise BadInput("is not an OFF file", where=path, remedy=WRITE_AGAIN)
     textured, coloured, with_normals, four, any_ = (group is not None for group in head.groups())
     body = data[head.end() :]
     if four or any_ or re.match(rb"\s*BINARY", body):

@@ -13,6 +13,7 @@ from pipeline.geometry import Floats
 from pipeline.ply import FORMATS, LONGEST_HEADER, TYPES
 from pipeline.render.mesh_files.beside import decode_texture, read_beside
 from pipeline.render.mesh_files.text import (
+    WRITE_AGAIN,
     colours_01,
     damaged,
     floats,
@@ -71,7 +72,7 @@ def read_ply_mesh(path: Path, max_faces: int) -> list[Part]:
     vertex, face = table.get("vertex", {}), table["face"]
     xyz, corners = _together(vertex, "xyz"), next((face[name] for name in CORNER_NAMES if name in face), None)
     if xyz is None or not isinstance(corners, Lists):
-        raise BadInput("is a PLY file without vertices or faces", where=path)
+        raise BadInput("is a PLY file without vertices or faces", where=path, remedy=WRITE_AGAIN)
     if not np.isfinite(corners.values).all():  # indices may be floats
         raise damaged(path, "an index is not finite")
     flat = np.clip(corners.values, -1, 1 << 40).astype(np.int64)
@@ -108,7 +109,7 @@ def read_header(data: bytes, path: Path) -> Header:
     head, found, _ = data[:LONGEST_HEADER].partition(b"end_header")
     size = data.find(b"\n", len(head)) + 1
     if not data.startswith(b"ply") or not found or not size:
-        raise BadInput("is not a PLY file", where=path)
+        raise BadInput("is not a PLY file", where=path, remedy=WRITE_AGAIN)
     kind, elements, textures = "", list[Element](), list[str]()
     for line in head.decode(errors="replace").splitlines():
         words = line.split()
