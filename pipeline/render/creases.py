@@ -18,7 +18,7 @@ SHARP_DEG, FEW, SAME = 60.0, 0.02, 0.999
 
 def weld(vertices: Floats) -> tuple[Indices, Indices]:
     """Vertices at exactly the same place: (W,) a row for each place, and (V,) the number of each vertex's place."""
-    x, y, z = (vertices + 0.0).T  # -0 becomes 0
+    x, y, z = vertices.T
     order = np.lexsort((z, y, x))
     placed = vertices[order]
     new = np.ones(len(vertices), dtype=bool)

@@ -86,7 +86,8 @@ def test_concave_polygons_are_covered_once(tmp_path: Path) -> None:
     star = [[np.cos(a) * r, np.sin(a) * r, 0] for a, r in zip(np.arange(10) * np.pi / 5, [2, 0.5] * 5, strict=True)]
     x, y = np.array(star)[:, :2].T
     expected = float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2)
-    for turned in (star, [[z, a, b] for a, b, z in star], [[b, z, a] for a, b, z in star]):
+    around = (star, [[z, a, b] for a, b, z in star], [[b, z, a] for a, b, z in star])
+    for turned in (*around, *(points[::-1] for points in around)):
         model = load(tmp_path / "star.obj", w.obj([list(range(10))], np.array(turned)))
         assert model.n_faces == 8 and area(model) == pytest.approx(expected)
     arrow = np.array([[0, 0, 0], [2, 1, 0], [0, 2, 0], [1, 1, 0]])
@@ -99,6 +100,8 @@ def test_degenerate_and_repeated_faces_and_lone_vertices_go(tmp_path: Path) -> N
     plain = w.obj(w.TRIANGLES)
     (part,) = load(tmp_path / "x.obj", plain + extra).parts
     assert len(part.faces) == 12 and part.vertices.max() == 3
+    lone = w.off("OFF\n9 6 0\n").replace("1 2 3\n", "1 2 3\n1e9 nan 0\n", 1)
+    assert load(tmp_path / "x.off", lone).parts[0].vertices.max() == 3, "nobody sees it"
 
 
 def test_an_object_that_is_inside_out_is_turned_over(tmp_path: Path) -> None:
@@ -106,6 +109,11 @@ def test_an_object_that_is_inside_out_is_turned_over(tmp_path: Path) -> None:
     outwards = part.vertices[part.faces].mean(axis=1) - w.BOX.mean(axis=0)
     assert (outwards * cross(part)).sum(axis=1).min() > 0
     assert part.normals is not None and (outwards * part.normals[part.faces].sum(axis=1)).sum(axis=1).min() > 0
+    inwards = "vn 0 0 1\nvn 0 0 -1\nvn 0 1 0\nvn 0 -1 0\nvn 1 0 0\nvn -1 0 0\n"
+    faces = "".join("f " + " ".join(f"{i + 1}//{k + 1}" for i in q[::-1]) + "\n" for k, q in enumerate(w.QUADS))
+    (part,) = load(tmp_path / "x.obj", w.lines(w.BOX, "v ") + inwards + faces).parts
+    assert part.normals is not None
+    assert np.allclose(part.normals[part.faces[:, 0]] * np.linalg.norm(cross(part), axis=1)[:, None], cross(part))
 
 
 BROKEN = {

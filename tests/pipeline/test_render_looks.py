@@ -92,6 +92,8 @@ def test_shapenet_keeps_images_beside_the_models_folder(tmp_path: Path) -> None:
     w.write(models.parent / "images/t.png", w.png(RED))
     assert load(models / "model_normalized.obj", TEXTURED)[0].texture is not None
     assert "outside its folder" in refusal(models / "other.obj", TEXTURED)
+    w.write(models.parent / "m.mtl", "newmtl skin\nmap_Kd ../t.png\n")
+    assert "outside its folder" in refusal(models.parent / "model_normalized.obj", TEXTURED)
     w.write(models / "m.mtl", "newmtl skin\nmap_Kd ../../t.png\n")
     assert "outside its folder" in refusal(models / "model_normalized.obj", TEXTURED)
 

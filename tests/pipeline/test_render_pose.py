@@ -53,6 +53,49 @@ def test_from_a_side_where_it_would_fall_over_it_rolls_on() -> None:
     assert probability(straight, (0, 0, -1)) > 0
 
 
+def naive_sides(points: Floats) -> dict[tuple[float, ...], float]:
+    """What `resting_sides` says, triangle by triangle, of a hull whose sides are all triangles."""
+    from scipy.spatial import ConvexHull, Delaunay
+
+    cells = points[Delaunay(points).simplices]
+    volumes = np.abs(np.linalg.det(cells[:, 1:] - cells[:, :1]))
+    centre = (cells.mean(axis=1) * volumes[:, None]).sum(axis=0) / volumes.sum()
+    hull = ConvexHull(points)
+    sides = [frozenset(side.tolist()) for side in hull.simplices]
+
+    def next_side(i: int) -> int:
+        normal, worst, target = hull.equations[i, :3], 1e-9, i
+        for corner in sides[i]:
+            a, b = (points[k] for k in sides[i] - {corner})
+            outward = np.cross(b - a, normal)
+            outward *= -np.sign(outward @ (points[corner] - a)) / np.linalg.norm(outward)
+            if outward @ (centre - a) > worst:
+                worst = outward @ (centre - a)
+                target = next(j for j, side in enumerate(sides) if j != i and sides[i] - {corner} < side)
+        return target
+
+    result: dict[tuple[float, ...], float] = {}
+    for i, side in enumerate(sides):
+        a, b, c = ((v / np.linalg.norm(v)) for v in (points[list(side)] - centre))
+        solid = 2 * np.arctan2(abs(a @ np.cross(b, c)), 1 + a @ b + b @ c + c @ a)
+        rest = i
+        while (following := next_side(rest)) != rest:
+            rest = following
+        key = tuple(hull.equations[rest, :3].round(6).tolist())
+        result[key] = result.get(key, 0) + solid / (4 * np.pi)
+    return result
+
+
+def test_sides_agree_with_a_naive_walk_over_the_hull() -> None:
+    for seed in range(5):
+        points = np.random.default_rng(seed).normal(size=(30, 3)) * (1, 2, 3)
+        normals, probabilities = resting_sides(points)
+        expected = naive_sides(points)
+        assert len(expected) == len(normals) < 20
+        for normal, value in zip(normals, probabilities, strict=True):
+            assert value == pytest.approx(expected[tuple(normal.round(6).tolist())], rel=1e-6)
+
+
 @pytest.mark.parametrize("pose", ["stable", "upright"])
 def test_posed_objects_have_one_size_and_stand_in_the_middle(pose: str) -> None:
     for seed in range(20):
@@ -85,6 +128,8 @@ def test_up_axes_and_the_turn() -> None:
     for up, axes in (("z", [0, 1, 2]), ("y", [1, 2, 0]), ("x", [2, 0, 1])):  # cyclic: no mirror
         vertices = posed(model(tip[:, axes]), up=up, pose="upright", rng=generator(1)).vertices()
         assert vertices[8, 2] == pytest.approx(0.5), "the tip points up"
+        edges = vertices[[1, 2, 4]] - vertices[0]
+        assert np.linalg.det(edges) > 0, "no mirror"
     turns = [posed(model(), up="z", pose="upright", rng=generator(seed)).vertices() for seed in range(200)]
     angles = [np.arctan2(*(v[1] - v[0])[1::-1]) for v in turns]  # of the box's first edge
     assert abs(np.exp(1j * np.array(angles)).mean()) < 0.2 and np.ptp(angles) > 6, "all round"
