@@ -14,7 +14,6 @@ and beside photos and videos those that are given).
 from __future__ import annotations
 
 import hashlib
-from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,8 +22,9 @@ from typing import Any, Literal
 from dope.common import files
 from dope.common.errors import BadInput, UsageError, legible
 from pipeline.inputs.photos import PHOTO_SUFFIXES, UNSUPPORTED_PHOTOS, list_photos, natural_order, unsupported_photos
+from pipeline.inputs.unique_ids import name_of, with_unique_ids
 from pipeline.refused import refused
-from pipeline.sequence import find_sequences, sequence_id
+from pipeline.sequence import find_sequences
 from pipeline.stages import StageResult
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"})
@@ -118,7 +118,7 @@ def find_sources(
             else:
                 unwritable = BadInput("its name is not UTF-8", where=source.path, remedy="Rename it")
                 errors.append((source.id, source.path, unwritable))
-    found = [_labelled(source, category, category_from) for source in _with_unique_ids(found, known or {})]
+    found = [_labelled(source, category, category_from) for source in with_unique_ids(found, known or {})]
     kept: list[Source] = []
     for source in found:
         try:
@@ -210,10 +210,10 @@ def _sources_or_error(
     try:
         yield from _expand(path, above, beside, top=top)
     except BadInput as error:
-        yield _name(path), path, error
+        yield name_of(path), path, error
     except OSError as error:
         unreadable = BadInput(f"cannot be read ({error.strerror})", where=error.filename or path)
-        yield _name(path), path, unreadable
+        yield name_of(path), path, unreadable
 
 
 def _expand(path: Path, above: set[Path], beside: list[str], *, top: bool) -> Iterator[Source | SourceError]:
@@ -273,7 +273,7 @@ def _expand(path: Path, above: set[Path], beside: list[str], *, top: bool) -> It
 
 def _source(path: Path, kind: Literal["video", "photos"]) -> Source:
     source = Source(path, "", kind)
-    return replace(source, id=_name(source.home))
+    return replace(source, id=name_of(source.home))
 
 
 def _remedy(entries: list[Path]) -> str:
@@ -282,58 +282,6 @@ def _remedy(entries: list[Path]) -> str:
         return f"Convert {', '.join(foreign)} files to JPEG first"
     known = ", ".join(sorted(suffix[1:] for suffix in PHOTO_SUFFIXES))
     return f"Photos are {known} files"
-
-
-def _name(path: Path) -> str:
-    path = path.absolute()  # "." and ".." have no name of their own
-    path = path if path.name not in ("", "..") else path.resolve()
-    return sequence_id(path.name if path.is_dir() else path.stem)
-
-
-def _with_unique_ids(sources: list[Source], known: Mapping[Path, str]) -> list[Source]:
-    """Prefix parents' names until no two ids are equal on any file system, then the file type, then a number.
-
-    Ids depend on the sources given and on what WORK held before them, not on how far their own preparation came: a
-    run that goes on, or a container that starts late, gives the ids that the first one gave. Known sources keep their
-    ids, and nobody else gets one of those.
-    """
-    places = [source.path.resolve() for source in sources]
-    others = {name.casefold() for place, name in known.items() if place not in set(places)}
-    named = [
-        replace(source, id=known.get(place, source.id))
-        for source, place in zip(_unique([*sources], others), places, strict=True)
-    ]
-    new = [source for source, place in zip(named, places, strict=True) if place not in known]
-    renamed = iter(_unique(new, {name.casefold() for name in known.values()}))
-    return [source if place in known else next(renamed) for source, place in zip(named, places, strict=True)]
-
-
-def _unique(sources: list[Source], reserved: set[str]) -> list[Source]:
-    for level in range(1, 5):
-        groups: dict[str, list[int]] = defaultdict(list)
-        for index, source in enumerate(sources):
-            groups[source.id.casefold()].append(index)
-        taken_names = [name for name, group in groups.items() if len(group) > 1 or name in reserved]
-        clashes = [index for name in taken_names for index in groups[name]]
-        if not clashes:
-            return sources
-        for index in clashes:
-            source = sources[index]
-            parents = [p.name for p in source.home.absolute().parents if p.name]
-            if level <= 3:
-                prefix = "_".join(reversed(parents[:level]))
-                name = f"{prefix}_{_name(source.home)}"
-            else:
-                name = f"{source.id}_{source.path.suffix[1:] or 'photos'}"
-            sources[index] = replace(source, id=sequence_id(name))
-    taken = set(reserved)
-    for index, source in enumerate(sources):
-        name, number = source.id, 2
-        while name.casefold() in taken:
-            name, number = f"{source.id}_{number}", number + 1
-        taken.add(name.casefold())
-        sources[index] = replace(source, id=name)
-    return sources
 
 
 def _labelled(source: Source, category: str | None, category_from: str) -> Source:
