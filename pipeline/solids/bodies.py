@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.geometry import Floats
 from pipeline.solids import grids
 from pipeline.solids.mesh import Mesh, outward, welded
-from pipeline.solids.outlines import circle, inset, rectangle, rounded
+from pipeline.solids.outlines import circle, finer, inset, rectangle, rounded
 from pipeline.solids.triangulate import triangulate
 
 
@@ -36,6 +36,8 @@ def extrude(
         twist_deg: by how much the top is turned.
     """
     loops = [outline, *(hole[::-1] for hole in holes)]
+    if twist_deg:  # long sides would be too warped for two triangles
+        loops = [finer(loop, 0.25 * float(np.abs(outline).max())) for loop in loops]
     starts = np.cumsum([0, *(len(loop) for loop in loops)])
     flat = np.concatenate(loops)
     rings: list[tuple[float, Floats]] = [(z, flat) for z in np.linspace(0, 1, levels + 1)]
@@ -43,8 +45,8 @@ def extrude(
         angle = np.linspace(0, np.pi / 2, bevel_steps + 1)[:-1]
         depth = min(bevel / height, 0.45)
         edge = [
-            (depth * (1 - np.sin(a)), np.concatenate([inset(loop, bevel * (1 - np.cos(b))) for loop in loops]))
-            for a, b in zip(angle, np.pi / 2 - angle, strict=True)
+            (depth * (1 - np.cos(a)), np.concatenate([inset(loop, bevel * (1 - np.sin(a))) for loop in loops]))
+            for a in angle
         ]
         inner = [(depth + (1 - 2 * depth) * z, flat) for z in np.linspace(0, 1, levels + 1)]
         rings = [*edge, *inner, *((1 - z, ring) for z, ring in edge[::-1])]

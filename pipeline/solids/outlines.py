@@ -140,6 +140,13 @@ def inset(outline: Floats, distance: float) -> Floats:
     return outline
 
 
+def finer(outline: Floats, longest: float) -> Floats:
+    """The same outline, its sides cut into equal pieces no longer than `longest`."""
+    ahead = np.roll(outline, -1, 0) - outline
+    pieces = np.ceil(np.linalg.norm(ahead, axis=1) / longest).astype(int)
+    return np.concatenate([p + a * np.arange(n)[:, None] / n for p, a, n in zip(outline, ahead, pieces, strict=True)])
+
+
 def turned(outline: Floats, degrees: float) -> Floats:
     """Turned counter-clockwise about the origin."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))

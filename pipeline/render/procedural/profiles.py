@@ -18,7 +18,7 @@ def turned_side(d: Dice, height: float, radius: float) -> Floats:
     A chain of cylinders, cones, beads, coves, grooves, flanges and curves that share a few radii, as a turner makes it;
     a third are symmetric about their middle.
     """
-    sizes = [radius, radius * d.real(0.3, 0.9), radius * d.real(0.15, 0.75)]
+    sizes = [radius, radius * d.real(0.35, 0.9), radius * d.real(0.25, 0.75)]
     count = d.whole(1, 5)
     symmetric = count > 1 and d.chance(0.35)
     lengths = np.array([d.log(0.25, 2.0) for _ in range(count)])

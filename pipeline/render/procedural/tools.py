@@ -28,7 +28,7 @@ def _grip(d: Dice, long: float, thick: float) -> Mesh:
 
 def hand_tool(d: Dice) -> list[Piece]:
     """A handle with a head: hammers, mallets, axes, drivers, chisels, shovels, brushes, rollers, rakes, spoons."""
-    long, thick = d.log(1.0, 4.0), d.real(0.09, 0.18)
+    long, thick = d.log(0.8, 3.0), d.log(0.1, 0.26)
     found = pieces("handle", _grip(d, long, thick))
     z = long - 0.02
     head = d.pick(("hammer", "mallet", "axe", "driver", "chisel", "shovel", "brush", "rake", "spoon", "pick", "blade", "fork"))
@@ -206,7 +206,8 @@ def device(d: Dice) -> list[Piece]:
         cable = spline([(0, 0.48 * l, 0.5 * t), (0.1, 0.6 * l + 0.2, 0.5 * t), (-0.2, 0.6 * l + 0.5, 0.3 * t), (0.1, 0.6 * l + 0.9, 0.3 * t)], 30)
         found += pieces("cable", tube(cable, min(0.05, 0.3 * t), sides=12))
     if d.chance(0.5):
-        found = [Piece(p.mesh.turned(0, d.pick((90.0, 75.0))), p.role) if False else Piece(p.mesh.turned(0, 80.0), p.role) for p in found]
+        tilt = d.pick((90.0, 75.0))
+        found = [Piece(p.mesh.turned(0, tilt), p.role) for p in found]
     return found
 
 
@@ -258,7 +259,8 @@ def vehicle(d: Dice) -> list[Piece]:
 
 def umbrella(d: Dice) -> list[Piece]:
     """Things with a canopy on a stem: umbrellas, mushrooms, parasols, trees, pins, balloons, lollipops."""
-    high, r = d.log(0.6, 2.5), d.real(0.5, 1.1)
+    high = d.log(0.6, 2.5)
+    r = d.real(0.5, 1.1) * min(1.0, high)
     thin = d.real(0.04, 0.25)
     stem = spline([(thin * d.real(1, 1.6), 0), (thin, 0.4 * high), (thin, high + 0.05)], 10)
     found = pieces("stem", turned_body(profiles.closed_profile(stem), 20))
