@@ -209,7 +209,9 @@ def superquadric(radii: ArrayLike, power_round: float, power_up: float, *, rows:
     return welded([grid]).scaled(radii)
 
 
-def supertoroid(radius: float, half: ArrayLike, power_round: float, power_up: float, *, rows: int = 20, columns: int = 48) -> Mesh:
+def supertoroid(
+    radius: float, half: ArrayLike, power_round: float, power_up: float, *, rows: int = 20, columns: int = 48
+) -> Mesh:
     """A ring (Barr 1981) of middle radius `radius` whose section has half sizes (2,) across and up."""
     v, u = np.linspace(0, 2 * np.pi, rows + 1), np.linspace(0, 2 * np.pi, columns + 1)
     v[-1] = u[-1] = 0

@@ -23,7 +23,10 @@ def rectangle(width: float, height: float, centre: ArrayLike = (0, 0)) -> Floats
 def slot(length: float, width: float, count: int = 8, centre: ArrayLike = (0, 0)) -> Floats:
     """A stadium along x, `length` long in all, with `count` steps round each end."""
     angle = np.linspace(-np.pi / 2, np.pi / 2, count + 1)
-    end = 0.5 * width * np.stack([np.cos(angle), np.sin(angle)], axis=1) + (max(0.5 * (length - width), 1e-3 * width), 0)
+    end = 0.5 * width * np.stack([np.cos(angle), np.sin(angle)], axis=1) + (
+        max(0.5 * (length - width), 1e-3 * width),
+        0,
+    )
     return np.concatenate([end, -end]) + np.asarray(centre, dtype=float)
 
 
@@ -83,7 +86,20 @@ def profile(kind: str, width: float, height: float, wall: float) -> Floats:
     elif kind == "T":
         points = [(m, 0), (n, 0), (n, h - t), (w, h - t), (w, h), (0, h), (0, h - t), (m, h - t)]
     elif kind in ("I", "H"):
-        points = [(0, 0), (w, 0), (w, t), (n, t), (n, h - t), (w, h - t), (w, h), (0, h), (0, h - t), (m, h - t), (m, t), (0, t)]
+        points = [
+            (0, 0),
+            (w, 0),
+            (w, t),
+            (n, t),
+            (n, h - t),
+            (w, h - t),
+            (w, h),
+            (0, h),
+            (0, h - t),
+            (m, h - t),
+            (m, t),
+            (0, t),
+        ]
         if kind == "H":
             points = [(0, 0), (t, 0), (t, (h - t) / 2), (w - t, (h - t) / 2), (w - t, 0), (w, 0), (w, h), (w - t, h)]
             points += [(w - t, (h + t) / 2), (t, (h + t) / 2), (t, h), (0, h)]

@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.geometry import Floats
 from pipeline.render.procedural import profiles
-from pipeline.render.procedural.pieces import Dice, Piece, around, both, in_row, pieces
+from pipeline.render.procedural.pieces import Dice, Piece, around, in_row, pieces
 from pipeline.solids import outlines
 from pipeline.solids.bodies import ball, block, cylinder, extrude, pipe, ring, soft_box, superquadric, tube, turned_body
 from pipeline.solids.mesh import Mesh
@@ -36,7 +36,9 @@ def _core(d: Dice) -> Mesh:
     if kind == "soft":
         return soft_box((w, l, high), d.real(0.1, 0.45))
     if kind == "bar":
-        return cylinder(0.5 * min(w, high), 2 * l, segments=28, bevel=0.03).at(z=-l).turned(1, 90).at(z=0.5 * min(w, high))
+        return (
+            cylinder(0.5 * min(w, high), 2 * l, segments=28, bevel=0.03).at(z=-l).turned(1, 90).at(z=0.5 * min(w, high))
+        )
     return superquadric((0.5 * w, 0.5 * l, 0.5 * high), 4, 3, rows=18, columns=32).at(z=0.5 * high)
 
 
@@ -57,32 +59,26 @@ def _features(d: Dice, core: Mesh, depth: int) -> list[Mesh]:
     if where == "foot":
         t = d.real(0.05, 0.2) * float(size.min()) + 0.03
         grow = d.real(1.15, 1.8)
-        shape = d.pick((outlines.rounded(outlines.rectangle(grow * size[0], grow * size[1]), 0.1 * float(size[:2].min()), 4), outlines.circle(0.5 * grow * float(size[:2].max()), 36)))
+        shape = d.pick(
+            (
+                outlines.rounded(outlines.rectangle(grow * size[0], grow * size[1]), 0.1 * float(size[:2].min()), 4),
+                outlines.circle(0.5 * grow * float(size[:2].max()), 36),
+            )
+        )
         return [extrude(shape, t, bevel=0.1 * t).at(middle[0], middle[1], low[2] - 0.7 * t)]
     if where == "top":
         scale = d.real(0.25, 0.8) * float(size[:2].min())
         made = _feature(d, scale, depth)
-        spot = (0.0, 0.0)
-        mirror = d.chance(0.4)
-        if mirror:
+        spots = [0.0]
+        if d.chance(0.4):
             made = [m.scaled(0.45) for m in made]
-            spot = (0.27 * float(size[0]), 0.0)
-        z = _hit(core, np.array([middle[0] + spot[0], middle[1] + spot[1], high[2] + 1]), np.array([0.0, 0, -1]))
-        if z is None:
-            return []
-        placed = [m.at(middle[0] + spot[0], middle[1] + spot[1], z[2]) for m in made]
-        return [copy for m in placed for copy in (both(m.at(x=-middle[0])) if mirror else [m])]
+            spots = [-0.27 * float(size[0]), 0.27 * float(size[0])]
+        return _set_on(core, made, [(middle[0] + x, middle[1]) for x in spots])
     if where == "row":
         n = d.whole(2, 5)
         pitch = 0.85 * float(size[0]) / n
         made = _feature(d, min(0.7 * pitch, 0.6 * float(size[1])), 1)
-        found = []
-        for k in range(n):
-            x = middle[0] + pitch * (k - 0.5 * (n - 1))
-            place = _hit(core, np.array([x, middle[1], high[2] + 1]), np.array([0.0, 0, -1]))
-            if place is not None:
-                found += [m.at(*place) for m in made]
-        return found
+        return _set_on(core, made, [(middle[0] + pitch * (k - 0.5 * (n - 1)), middle[1]) for k in range(n)])
     level = d.real(0.3, 0.7) * float(size[2])
     scale = d.real(0.25, 0.75) * min(float(size[1]), float(size[2]), 2 * level)
     made = _feature(d, scale, depth)
@@ -101,10 +97,22 @@ def _features(d: Dice, core: Mesh, depth: int) -> list[Mesh]:
     return found
 
 
+def _set_on(core: Mesh, made: list[Mesh], places: list[tuple[float, float]]) -> list[Mesh]:
+    """Copies of a feature on the core's upper side at positions (x, y); none where there is nothing to stand on."""
+    found = []
+    for x, y in places:
+        place = _hit(core, np.array([x, y, float(core.high[2]) + 1]), np.array([0.0, 0, -1]))
+        if place is not None:
+            found += [m.at(*place) for m in made]
+    return found
+
+
 def _feature(d: Dice, size: float, depth: int) -> list[Mesh]:
     """What stands on a core, along z from just below 0, about as wide as `size`."""
     r = 0.5 * size
-    kind = d.pick(("stud", "block", "dome", "port", "port", "lever", "knob", "fin", "eye", "bolt", "cone", "core", "disc", "grip"))
+    kind = d.pick(
+        ("stud", "block", "dome", "port", "port", "lever", "knob", "fin", "eye", "bolt", "cone", "core", "disc", "grip")
+    )
     sink = -0.25 * r
     if kind == "core" and depth == 0:
         core = _core(d)
@@ -122,8 +130,14 @@ def _feature(d: Dice, size: float, depth: int) -> list[Mesh]:
         long = d.log(0.5, 2.0) * size
         tube_ = pipe(0.62 * r, 0.42 * r, long - sink, segments=24).at(z=sink)
         holes = [outlines.turned(outlines.circle(0.09 * r, 8) + (0.8 * r, 0), 60 * k) for k in range(6)]
-        rim = extrude(outlines.circle(r, 32), 0.2 * r, holes=[outlines.circle(0.42 * r, 24), *holes]).at(z=long - 0.19 * r)
-        return [tube_, rim] if d.chance(0.7) else [tube_, pipe(0.75 * r, 0.5 * r, 0.3 * r, segments=24).at(z=long - 0.28 * r)]
+        rim = extrude(outlines.circle(r, 32), 0.2 * r, holes=[outlines.circle(0.42 * r, 24), *holes]).at(
+            z=long - 0.19 * r
+        )
+        return (
+            [tube_, rim]
+            if d.chance(0.7)
+            else [tube_, pipe(0.75 * r, 0.5 * r, 0.3 * r, segments=24).at(z=long - 0.28 * r)]
+        )
     if kind == "lever":
         long, lean = d.log(1.5, 4) * size, d.real(-1.0, 1.0)
         bar = tube([(0, 0, sink), (0, 0, 0.4 * long), (0, lean * 0.5 * long, long)], 0.22 * r, sides=12)
@@ -134,11 +148,18 @@ def _feature(d: Dice, size: float, depth: int) -> list[Mesh]:
         return [cylinder(0.5 * r, 0.6 * r - sink).at(z=sink), grip.at(z=0.5 * r)]
     if kind == "fin":
         n = d.whole(2, 5)
-        return in_row(block((0.5 * size / n, size, d.real(0.4, 1.2) * size - sink)).at(z=sink), n, (size / n, 0, 0))
+        fins = in_row(block((0.5 * size / n, size, d.real(0.4, 1.2) * size - sink)).at(z=sink), n, (size / n, 0, 0))
+        return [block((1.02 * size, 1.02 * size, 0.12 * r - sink)).at(z=sink), *fins]
     if kind == "eye":
-        return [cylinder(0.45 * r, 0.6 * r - sink).at(z=sink), ring(0.7 * r, 0.25 * r, segments=28).turned(0, 90).at(z=1.2 * r)]
+        return [
+            cylinder(0.45 * r, 0.6 * r - sink).at(z=sink),
+            ring(0.7 * r, 0.25 * r, segments=28).turned(0, 90).at(z=1.2 * r),
+        ]
     if kind == "bolt":
-        return [cylinder(r, 0.2 * r - sink).at(z=sink), cylinder(0.75 * r, 0.7 * r, segments=6, bevel=0.08 * r).at(z=0.15 * r)]
+        return [
+            cylinder(r, 0.2 * r - sink).at(z=sink),
+            cylinder(0.75 * r, 0.7 * r, segments=6, bevel=0.08 * r).at(z=0.15 * r),
+        ]
     if kind == "cone":
         return [cylinder(r, d.log(0.5, 2.5) * size - sink, top=d.real(0.05, 0.7)).at(z=sink)]
     if kind == "disc":
@@ -146,7 +167,7 @@ def _feature(d: Dice, size: float, depth: int) -> list[Mesh]:
         teeth = outlines.gear(d.whole(10, 20), wide, 0.15 * wide) if d.chance(0.4) else outlines.circle(wide, 36)
         return [cylinder(0.35 * r, 1.2 * r - sink).at(z=sink), extrude(teeth, 0.35 * r, bevel=0.03 * r).at(z=0.5 * r)]
     legs = [(-0.8 * r, 0, sink), (-0.8 * r, 0, r), (0.8 * r, 0, r), (0.8 * r, 0, sink)]
-    return [tube(np.array(legs), 0.18 * r, sides=12)]
+    return [cylinder(r, 0.1 * r - sink).at(z=sink), tube(np.array(legs), 0.18 * r, sides=12)]
 
 
 def _hit(mesh: Mesh, origin: Floats, direction: Floats) -> Floats | None:

@@ -21,13 +21,22 @@ def column(d: Dice) -> list[Piece]:
     found += pieces("base", turned_body(profiles.closed_profile(side), 32).at(z=t - 0.01))
     z = t + 0.38
     n = d.whole(8, 14)
-    shape = outlines.rectangle(1.7 * r, 1.7 * r) if square else outlines.petals(n, r, 0.12, n * 8) if d.chance(0.5) else outlines.circle(r, 32)
+    shape = (
+        outlines.rectangle(1.7 * r, 1.7 * r)
+        if square
+        else outlines.petals(n, r, 0.12, n * 8)
+        if d.chance(0.5)
+        else outlines.circle(r, 32)
+    )
     found += pieces("shaft", extrude(shape, high, top=d.real(0.75, 1.0), levels=1, twist_deg=0).at(z=z))
     z += high - 0.01
     found += pieces("capital", cylinder(0.45, 0.3, top=1.5, segments=d.pick((32, 8, 4))).at(z=z))
     found += pieces("capital", block((1.45, 1.45, d.real(0.1, 0.25)), bevel=0.02).at(z=z + 0.29))
     if d.chance(0.4):
-        found += pieces("top", d.pick((ball(0.5).at(z=z + 0.85), cylinder(0.6, 0.9, top=0.05, segments=4).turned(2, 45).at(z=z + 0.38))))
+        found += pieces(
+            "top",
+            d.pick((ball(0.5).at(z=z + 0.85), cylinder(0.6, 0.9, top=0.05, segments=4).turned(2, 45).at(z=z + 0.38))),
+        )
     return found
 
 
@@ -85,7 +94,9 @@ def stairs(d: Dice) -> list[Piece]:
         tall = d.real(0.5, 0.9)
         ends = [(0.5 * run, 0.42 * w, rise), ((n - 0.5) * run, 0.42 * w, n * rise)]
         rail = tube_between(np.array(ends) + (0, 0, tall), 0.04)
-        posts = [block((0.05, 0.05, tall + 0.02)).at((k + 0.5) * run, 0.42 * w, (k + 1) * rise - 0.01) for k in range(n)]
+        posts = [
+            block((0.05, 0.05, tall + 0.02)).at((k + 0.5) * run, 0.42 * w, (k + 1) * rise - 0.01) for k in range(n)
+        ]
         found += pieces("rail", *both(rail, 1), *[m for post in posts for m in both(post, 1)])
     return found
 
@@ -134,7 +145,10 @@ def house(d: Dice) -> list[Piece]:
         r = d.real(0.2, 0.35)
         up = high + peak * d.real(0.6, 1.6)
         sides = d.pick((4, 24, 8))
-        tower = [Piece(cylinder(r, up, segments=sides), "walls"), Piece(cylinder(1.2 * r, d.real(0.3, 0.9), top=0.03, segments=sides).at(z=up - 0.01), "roof")]
+        tower = [
+            Piece(cylinder(r, up, segments=sides), "walls"),
+            Piece(cylinder(1.2 * r, d.real(0.3, 0.9), top=0.03, segments=sides).at(z=up - 0.01), "roof"),
+        ]
         found += [Piece(p.mesh.turned(2, 45 if sides == 4 else 0).at(0.5 * w, 0.35 * l), p.role) for p in tower]
     if d.chance(0.5):
         found += pieces("base", block((w + 0.3, l + 0.3, 0.1)).at(z=-0.09))
@@ -151,7 +165,9 @@ def fence(d: Dice) -> list[Piece]:
         shape = np.array([(-w, 0), (w, 0), (w, high), (0, high + w), (-w, high)])
         one = extrude(shape, 0.06).turned(0, 90)
     elif kind == "baluster":
-        one = turned_body(profiles.closed_profile(profiles.turned_side(d, high, min(0.35 * pitch, 0.16))), 14 if n > 7 else 20)
+        one = turned_body(
+            profiles.closed_profile(profiles.turned_side(d, high, min(0.35 * pitch, 0.16))), 14 if n > 7 else 20
+        )
     elif kind == "round":
         one = cylinder(0.2 * pitch, high, segments=16)
     else:
@@ -159,7 +175,11 @@ def fence(d: Dice) -> list[Piece]:
     found = pieces("pickets", *in_row(one, n, (pitch, 0, 0)))
     reach = long + 0.1
     if kind == "baluster":
-        found += pieces("rails", block((reach, 0.3, 0.1), bevel=0.02).at(z=high - 0.01), block((reach, 0.3, 0.1), bevel=0.02).at(z=-0.08))
+        found += pieces(
+            "rails",
+            block((reach, 0.3, 0.1), bevel=0.02).at(z=high - 0.01),
+            block((reach, 0.3, 0.1), bevel=0.02).at(z=-0.08),
+        )
     else:
         rail = block((reach, 0.09, 0.1)).at(y=0.03 if kind != "round" else 0)
         found += pieces("rails", rail.at(z=0.2 * high), rail.at(z=0.75 * high))
@@ -167,7 +187,12 @@ def fence(d: Dice) -> list[Piece]:
         post = block((0.16, 0.16, high * 1.2), bevel=0.02).at(z=-0.09)
         found += pieces("posts", *both(post.at(x=0.5 * reach)))
         if d.chance(0.6):
-            cap = d.pick((ball(0.12, count=12).at(z=high * 1.1 + 0.08), cylinder(0.15, 0.12, top=0.1, segments=4).turned(2, 45).at(z=high * 1.1)))
+            cap = d.pick(
+                (
+                    ball(0.12, count=12).at(z=high * 1.1 + 0.08),
+                    cylinder(0.15, 0.12, top=0.1, segments=4).turned(2, 45).at(z=high * 1.1),
+                )
+            )
             found += pieces("posts", *both(cap.at(x=0.5 * reach)))
     return found
 
@@ -204,7 +229,13 @@ def tiers(d: Dice) -> list[Piece]:
             found += pieces("roof", cylinder(1.06 * r, 0.08, segments=sides).at(z=z + high - 0.02))
             z, r = z + high + 0.05, r * d.real(0.55, 0.85)
     if kind != "fountain":
-        tip = d.pick((ball(0.4 * r).at(z=z + 0.3 * r), cylinder(0.5 * r, 1.2 * r, top=0.05).at(z=z - 0.02), cylinder(0.06, 1.2 * r, segments=12).at(z=z - 0.02)))
+        tip = d.pick(
+            (
+                ball(0.4 * r).at(z=z + 0.3 * r),
+                cylinder(0.5 * r, 1.2 * r, top=0.05).at(z=z - 0.02),
+                cylinder(0.06, 1.2 * r, segments=12).at(z=z - 0.02),
+            )
+        )
         found += pieces("tip", tip)
     else:
         found += pieces("stem", ball((0.3 * r, 0.3 * r, 0.6 * r)).at(z=z + 0.4 * r))
@@ -232,7 +263,10 @@ def blocks(d: Dice) -> list[Piece]:
         found = []
         for row in range(rows):
             shift = 0.5 * w * (row % 2)
-            found += [Piece(m.at(x=shift - 0.25 * w, z=row * 0.96), "body" if row % 2 else "other") for m in in_row(brick, n, (w * 0.965, 0, 0))]
+            found += [
+                Piece(m.at(x=shift - 0.25 * w, z=row * 0.96), "body" if row % 2 else "other")
+                for m in in_row(brick, n, (w * 0.965, 0, 0))
+            ]
         return found
     if kind == "bridge":
         span, w, high = d.real(2, 4), d.real(0.6, 1.2), d.real(0.5, 1.2)
@@ -243,7 +277,10 @@ def blocks(d: Dice) -> list[Piece]:
         rail = block((span, 0.06, 0.3)).at(y=0.5 * w - 0.05, z=high + 0.12)
         found += pieces("rails", *both(rail, 1))
         if d.chance(0.5):
-            arc = [(0.5 * span * np.cos(a), 0.5 * w - 0.02, high + 0.1 + 0.7 * np.sin(a)) for a in np.linspace(0.05, np.pi - 0.05, 20)]
+            arc = [
+                (0.5 * span * np.cos(a), 0.5 * w - 0.02, high + 0.1 + 0.7 * np.sin(a))
+                for a in np.linspace(0.05, np.pi - 0.05, 20)
+            ]
             found += pieces("rails", *both(along(np.array(arc), outlines.rectangle(0.1, 0.1), up=(0, 1, 0)), 1))
         return found
     found = pieces("base", block((2.2, 2.2, 0.15), bevel=0.03))

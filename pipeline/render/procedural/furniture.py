@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.render.procedural import profiles
-from pipeline.render.procedural.pieces import Dice, Piece, corners, both, in_grid, in_row, pieces
+from pipeline.render.procedural.pieces import Dice, Piece, both, corners, in_grid, in_row, pieces
 from pipeline.solids import outlines
 from pipeline.solids.bodies import along, ball, block, cylinder, extrude, ring, soft_box, tube, turned_body
 from pipeline.solids.mesh import Mesh
@@ -29,7 +29,9 @@ def _top(d: Dice, w: float, l: float, thick: float) -> Mesh:
     if kind == "box":
         return block((w, l, thick), bevel=d.pick((0.0, 0.2 * thick)))
     if kind == "rounded":
-        return extrude(outlines.rounded(outlines.rectangle(w, l), d.real(0.1, 0.45) * min(w, l), 6), thick, bevel=0.2 * thick)
+        return extrude(
+            outlines.rounded(outlines.rectangle(w, l), d.real(0.1, 0.45) * min(w, l), 6), thick, bevel=0.2 * thick
+        )
     if kind == "oval":
         return extrude(outlines.superellipse(w, l, d.real(2, 4)), thick, bevel=0.2 * thick)
     return soft_box((w, l, thick), 0.35)
@@ -84,15 +86,20 @@ def seat(d: Dice) -> list[Piece]:
         foot = cylinder(0.06, 0.16, top=1.3, segments=14).at(0.5 * w - 0.05, 0.4 * l, -0.14)
         return found + pieces("legs", *corners(foot))
     thick, leg, up = d.real(0.05, 0.14), d.real(0.04, 0.08), d.real(0.5, 1.3)
-    found = pieces("seat", _top(d, w, l, thick).at(z=high))
+    kind = d.pick(("panel", "slats", "bars", "bow"))
+    top = soft_box((w, l, thick), 0.35) if kind == "bow" else _top(d, w, l, thick)
+    found = pieces("seat", top.at(z=high))
     x, y = 0.5 * w - 1.2 * leg, 0.5 * l - 1.2 * leg
     one = _leg(d, high + 0.02, leg)
     found += pieces("legs", *corners(one.at(x * 0.97, y * 0.97)))
     lean = -d.real(0, 12)
     back: list[Mesh] = []
-    kind = d.pick(("panel", "slats", "bars", "bow"))
     if kind == "panel":
-        back.append(extrude(outlines.rounded(outlines.rectangle(0.95 * w, up), d.real(0.02, 0.3), 5), 0.08, bevel=0.02).turned(0, 90).at(z=0.5 * up))
+        back.append(
+            extrude(outlines.rounded(outlines.rectangle(0.95 * w, up), d.real(0.02, 0.3), 5), 0.08, bevel=0.02)
+            .turned(0, 90)
+            .at(z=0.5 * up)
+        )
     elif kind == "bow":
         half = 0.46 * w
         path = [(half * np.cos(a), 0, up * np.sin(a) ** 0.7) for a in np.linspace(0.0, np.pi, 18)]
@@ -104,7 +111,10 @@ def seat(d: Dice) -> list[Piece]:
         if kind == "slats":
             back += [block((2 * x, 0.05, 0.35 * up / n)).at(z=z * up) for z in np.linspace(0.35, 0.9, n)]
         else:
-            back += [block((2 * x, 0.07, 0.12)).at(z=0.86 * up), *in_row(block((0.05, 0.05, 0.9 * up)), n + 1, (1.6 * x / n, 0, 0))]
+            back += [
+                block((2 * x, 0.07, 0.12)).at(z=0.86 * up),
+                *in_row(block((0.05, 0.05, 0.9 * up)), n + 1, (1.6 * x / n, 0, 0)),
+            ]
     found += [Piece(m.turned(0, lean).at(y=y - 0.01, z=high + 0.4 * thick), "back") for m in back]
     if d.chance(0.25):
         rail = block((0.1, 0.8 * l, 0.06), bevel=0.015).at(x=x, z=high + 0.42)
@@ -140,14 +150,21 @@ def shelf(d: Dice) -> list[Piece]:
                 if grip == "knob":
                     one = ball(0.05, count=10).at(y=-0.5 * deep - 0.06)
                 elif grip == "bar":
-                    one = tube(np.array([(-0.15, 0, 0), (-0.15, -0.09, 0), (0.15, -0.09, 0), (0.15, 0, 0)]) * (min(1, fw), 1, 1), 0.02, sides=8).at(y=-0.5 * deep - 0.02)
+                    one = tube(
+                        np.array([(-0.15, 0, 0), (-0.15, -0.09, 0), (0.15, -0.09, 0), (0.15, 0, 0)])
+                        * (min(1, fw), 1, 1),
+                        0.02,
+                        sides=8,
+                    ).at(y=-0.5 * deep - 0.02)
                 else:
                     one = block((0.3 * fw, 0.05, 0.04)).at(y=-0.5 * deep - 0.04)
                 found += pieces("grips", *in_row(one.at(z=z + 0.5 * fh), columns, (fw, 0, 0)))
         if d.chance(0.4):
             found += pieces("top", block((w * 1.06, deep * 1.08, 0.07), bevel=0.02).at(z=high - 0.01))
     if d.chance(0.4):
-        found += pieces("feet", *corners(_leg(d, d.real(0.1, 0.5), 0.05).at(0.5 * w - 0.08, 0.5 * deep - 0.08).at(z=-0.0)))
+        found += pieces(
+            "feet", *corners(_leg(d, d.real(0.1, 0.5), 0.05).at(0.5 * w - 0.08, 0.5 * deep - 0.08).at(z=-0.0))
+        )
         lift = float(found[-1].mesh.high[2]) - 0.01
         n = len(found)
         found = [Piece(p.mesh.at(z=lift) if k < n - 4 else p.mesh, p.role) for k, p in enumerate(found)]
@@ -177,7 +194,13 @@ def crate(d: Dice) -> list[Piece]:
         found += pieces("posts", *in_row(block((w * 0.999, 0.14, 0.26)).at(z=0.05), 3, (0, 0.5 * l - 0.08, 0)))
         return found + pieces("slats", *in_row(board.at(z=0.0), 3, (0.5 * w - 0.5 * w / n, 0, 0)))
     if kind in ("tray", "bin"):
-        shape = d.pick((outlines.rounded(outlines.rectangle(w, l), d.real(0.05, 0.4), 5), outlines.superellipse(w, l, 4), outlines.circle(0.5 * w, 36)))
+        shape = d.pick(
+            (
+                outlines.rounded(outlines.rectangle(w, l), d.real(0.05, 0.4), 5),
+                outlines.superellipse(w, l, 4),
+                outlines.circle(0.5 * w, 36),
+            )
+        )
         grow = d.real(1.0, 1.35)
         wall = extrude(shape, high, holes=[outlines.inset(shape, t)], top=grow)
         found = pieces("body", wall, extrude(outlines.inset(shape, 0.3 * t), t))
@@ -192,7 +215,9 @@ def crate(d: Dice) -> list[Piece]:
         band = block((0.12, l + 0.1, high + 0.05))
         found += pieces("bands", *both(band.at(x=0.3 * w)))
     if d.chance(0.4):
-        grip = along(np.array([(-0.2, 0, 0), (-0.2, -0.12, 0), (0.2, -0.12, 0), (0.2, 0, 0)]), outlines.circle(0.03, 10))
+        grip = along(
+            np.array([(-0.2, 0, 0), (-0.2, -0.12, 0), (0.2, -0.12, 0), (0.2, 0, 0)]), outlines.circle(0.03, 10)
+        )
         found += [Piece(m, "grips") for m in both(grip.at(y=-0.5 * l + 0.01, z=0.6 * high), 1)]
     return found
 
@@ -201,7 +226,8 @@ def bed(d: Dice) -> list[Piece]:
     """Beds and benches: a frame with a mattress, boards at the ends, pillows."""
     w, l, high = d.real(0.9, 1.9), 2.1, d.real(0.2, 0.5)
     found = pieces("frame", block((w, l, 0.16)).at(z=high))
-    found += pieces("mattress", soft_box((0.95 * w, 0.97 * l, d.real(0.2, 0.35)), 0.35).at(z=high + 0.12))
+    soft = d.real(0.2, 0.35)
+    found += pieces("mattress", soft_box((0.95 * w, 0.97 * l, soft), 0.35).at(z=high + 0.12))
     post = _leg(d, high + 0.1, 0.06)
     found += pieces("legs", *corners(post.at(0.5 * w - 0.07, 0.5 * l - 0.07)))
     up = d.real(0.5, 1.2)
@@ -209,7 +235,7 @@ def bed(d: Dice) -> list[Piece]:
     if d.chance(0.6):
         found += pieces("boards", block((w + 0.04, 0.1, 0.6 * up), bevel=0.02).at(y=-0.5 * l, z=high))
     n = 1 if w < 1.3 else 2
-    pillow = soft_box((0.8 * w / n, 0.45, 0.18), 0.45).at(y=0.32 * l, z=high + 0.36)
+    pillow = soft_box((0.8 * w / n, 0.45, 0.18), 0.45).at(y=0.32 * l, z=high + soft + 0.08)
     return found + pieces("pillows", *in_row(pillow, n, (0.9 * w / n, 0, 0)))
 
 
@@ -219,8 +245,10 @@ def lamp(d: Dice) -> list[Piece]:
     found = pieces("base", cylinder(foot, d.real(0.06, 0.2), top=d.real(0.6, 1.0), bevel=0.02))
     wide, narrow, tall = d.real(0.45, 0.9), d.real(0.15, 0.5), d.real(0.3, 0.9)
     t = 0.04
-    shade = turned_body([(wide, 0), (narrow, tall), (narrow - t, tall), (wide - t, 0), (wide, 0)], d.pick((40, 40, 6, 12)))
-    hoop = cylinder(narrow - 0.02, 0.04).at(z=tall - 0.06)
+    shade = turned_body(
+        [(wide, 0), (narrow, tall), (narrow - t, tall), (wide - t, 0), (wide, 0)], d.pick((40, 40, 6, 12))
+    )
+    hoop = cylinder(narrow - 0.01, 0.04).at(z=tall - 0.025)
     if d.chance(0.5):
         if d.chance(0.5):
             stem = turned_body(profiles.closed_profile(profiles.turned_side(d, high, d.real(0.1, 0.3))), 28)
@@ -235,7 +263,11 @@ def lamp(d: Dice) -> list[Piece]:
     arm = tube([(0, 0, 0.03), elbow, tip], 0.05, sides=12)
     found += pieces("stem", arm, ball(0.09).at(*elbow))
     tilt = d.real(-10, 50)
-    head = [Piece(shade, "shade"), Piece(hoop, "shade"), Piece(cylinder(narrow * 0.8, 0.12, top=0.6).at(z=tall - 0.05), "trim")]
+    head = [
+        Piece(shade, "shade"),
+        Piece(hoop, "shade"),
+        Piece(cylinder(narrow * 0.8, 0.12, top=0.6).at(z=tall - 0.05), "trim"),
+    ]
     head.append(Piece(ball((0.11, 0.11, 0.15)).at(z=tall - 0.16), "bulb"))
     return found + [Piece(p.mesh.at(z=-tall).turned(1, -tilt).at(*tip), p.role) for p in head]
 

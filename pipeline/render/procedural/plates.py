@@ -91,9 +91,15 @@ def gear_shaft(d: Dice) -> list[Piece]:
         elif kind == "disc":
             found += pieces("disc", cylinder(r, 0.5 * wide, bevel=0.02).at(z=z))
         elif kind == "collar":
-            found += pieces("disc", cylinder(thin * d.real(1.3, 2.2), wide, bevel=0.02, segments=d.pick((24, 6))).at(z=z))
+            found += pieces(
+                "disc", cylinder(thin * d.real(1.3, 2.2), wide, bevel=0.02, segments=d.pick((24, 6))).at(z=z)
+            )
         else:
-            found += pieces("disc", cylinder(r, 0.4 * wide, top=0.75).at(z=z), cylinder(r * 0.75, 0.4 * wide, top=1 / 0.75).at(z=z + 0.39 * wide))
+            found += pieces(
+                "disc",
+                cylinder(r, 0.4 * wide, top=0.75).at(z=z),
+                cylinder(r * 0.75, 0.4 * wide, top=1 / 0.75).at(z=z + 0.39 * wide),
+            )
         z += wide + d.real(0.05, 0.8)
     return found
 
@@ -168,7 +174,12 @@ def fastener(d: Dice) -> list[Piece]:
         head = cylinder(r, 1.1 * r, top=2.1)
     elif kind == "wing":
         head = cylinder(1.3 * r, 1.3 * r, bevel=0.1 * r)
-        wing = extrude(outlines.rounded(np.array([(0, 0), (2.5 * r, 1.2 * r), (2.9 * r, 2.8 * r), (1.9 * r, 2.8 * r), (0, 1.2 * r)]), 0.4 * r, 4), 0.5 * r)
+        wing = extrude(
+            outlines.rounded(
+                np.array([(0, 0), (2.5 * r, 1.2 * r), (2.9 * r, 2.8 * r), (1.9 * r, 2.8 * r), (0, 1.2 * r)]), 0.4 * r, 4
+            ),
+            0.5 * r,
+        )
         found += pieces("head", *[w.at(z=top) for w in around(wing.turned(0, 90).at(y=0.25 * r), 2)])
     else:
         head = ring(1.5 * r, 0.45 * r, segments=28).turned(0, 90).at(z=1.8 * r)
@@ -214,7 +225,11 @@ def mounted(d: Dice) -> list[Piece]:
         one = pipe(r, 0.5 * r, h, segments=20).at(0.25 * w, 0.2 * l, top)
         found += pieces("body", *corners(one))
         if d.chance(0.6):
-            found += pieces("body", block((0.5 * w - 1.4 * r, 0.08, 0.6 * h)).at(0, 0.2 * l, top), block((0.5 * w - 1.4 * r, 0.08, 0.6 * h)).at(0, -0.2 * l, top))
+            found += pieces(
+                "body",
+                block((0.5 * w - 1.4 * r, 0.08, 0.6 * h)).at(0, 0.2 * l, top),
+                block((0.5 * w - 1.4 * r, 0.08, 0.6 * h)).at(0, -0.2 * l, top),
+            )
     elif kind == "block":
         bw, bl, h = w * d.real(0.35, 0.6), l * d.real(0.35, 0.75), d.log(0.3, 1.4)
         found += pieces("body", block((bw, bl, h), bevel=0.05).at(z=top))
@@ -228,7 +243,9 @@ def mounted(d: Dice) -> list[Piece]:
         r, thick = d.real(0.35, 0.55) * min(w, 1.6) * 0.7, d.real(0.25, 0.6) * l
         up = r * d.real(1.2, 1.8)
         arch = np.concatenate([[(-1.25 * r, 0), (1.25 * r, 0)], outlines.circle(r, 48)[:25] * 1.25 + (0, up)])
-        body = extrude(profiles._without_repeats(arch), thick, holes=[outlines.circle(0.7 * r, 28) + (0, up)], bevel=0.02)
+        body = extrude(
+            profiles._without_repeats(arch), thick, holes=[outlines.circle(0.7 * r, 28) + (0, up)], bevel=0.02
+        )
         found += pieces("body", body.turned(0, 90).at(y=0.5 * thick, z=top))
         if d.chance(0.6):
             axle = cylinder(0.72 * r, thick * d.real(1.4, 3.0), bevel=0.02)

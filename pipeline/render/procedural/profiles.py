@@ -198,7 +198,15 @@ def _wedge(d: Dice) -> Floats:
     return _maybe_round(d, np.array(points, dtype=float), 0.2)
 
 
-_COMPACT: tuple[Callable[[Dice], Floats], ...] = (_rectangle, _polygon, _ellipse, _superellipse, _gear, _petals, _rectangle)
+_COMPACT: tuple[Callable[[Dice], Floats], ...] = (
+    _rectangle,
+    _polygon,
+    _ellipse,
+    _superellipse,
+    _gear,
+    _petals,
+    _rectangle,
+)
 _OUTLINES: tuple[Callable[[Dice], Floats], ...] = (
     *(_rectangle, _polygon, _ellipse, _slot, _star, _gear, _petals, _superellipse, _profile, _profile),
     *(_sector, _mirrored, _mirrored, _arrow, _dee, _stepped, _stepped, _wedge),

@@ -84,7 +84,9 @@ def hull(d: Dice) -> list[Piece]:
     elif extra == "cabin":
         at = d.real(-0.4, 0.3)
         w, c, h = section(at)
-        found += pieces("cabin", superquadric((d.real(0.25, 0.45), 0.8 * w, 0.8 * h + 0.1), 2.5, 3).at(at, 0, c + 0.7 * h))
+        found += pieces(
+            "cabin", superquadric((d.real(0.25, 0.45), 0.8 * w, 0.8 * h + 0.1), 2.5, 3).at(at, 0, c + 0.7 * h)
+        )
     elif extra == "wheels":
         for at in (-0.6, 0.55):
             w, c, h = section(at)
@@ -127,7 +129,9 @@ def soft_group(d: Dice) -> list[Piece]:
         found = pieces("body", superquadric((core[0], core[0], core[2]), 2.0, _power(d)))
         found += pieces("trim", *around(one.at(x=core[0] * 0.95 - float(one.vertices[:, 0].mean())), n))
     elif style == "legs":
-        leg: Mesh = tube([(0.5 * core[0], 0.5 * core[1], 0), (0.9 * core[0], 0.9 * core[1], -core[2] - d.log(0.2, 0.8))], 0.4 * size)
+        leg: Mesh = tube(
+            [(0.5 * core[0], 0.5 * core[1], 0), (0.9 * core[0], 0.9 * core[1], -core[2] - d.log(0.2, 0.8))], 0.4 * size
+        )
         found += pieces("legs", *[m for half in both(leg, 0) for m in both(half, 1)])
         if d.chance(0.6):
             head = 0.6 * min(core)

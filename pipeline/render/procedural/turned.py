@@ -117,7 +117,12 @@ def _vessel_side(d: Dice, height: float) -> Floats:
         points = [(0.8 * foot, 0), (1.0, d.real(0.3, 0.6) * height), (d.real(0.5, 0.95), height)]
     elif kind == "neck":
         neck = d.real(0.2, 0.5)
-        points = [(0.8 * foot, 0), (1, d.real(0.25, 0.45) * height), (neck, 0.75 * height), (neck * d.real(1, 1.9), height)]
+        points = [
+            (0.8 * foot, 0),
+            (1, d.real(0.25, 0.45) * height),
+            (neck, 0.75 * height),
+            (neck * d.real(1, 1.9), height),
+        ]
     else:
         neck, up = d.real(0.2, 0.5), d.real(0.55, 0.75) * height
         straight = [(1.0, 0.0), (1.0, up)]
@@ -179,7 +184,9 @@ def _handles(d: Dice, radius_at: object, height: float, stand: float) -> list[Me
     if style == "ears":
         z = stand + high
         r = radius_at(high)
-        path = spline([(0.9 * r, -0.3 * r, z), (r + 0.3, -0.2 * r, z), (r + 0.3, 0.2 * r, z), (0.9 * r, 0.3 * r, z)], 16)
+        path = spline(
+            [(0.9 * r, -0.3 * r, z), (r + 0.3, -0.2 * r, z), (r + 0.3, 0.2 * r, z), (0.9 * r, 0.3 * r, z)], 16
+        )
         return both(tube(path, min(thick, 0.08)))
     a, b = stand + low, stand + high
     if style == "bow":
@@ -204,7 +211,9 @@ def _lid(d: Dice, lip: float) -> list[Mesh]:
     dome = spline([(lip * 1.05, 0.04), (0.65 * lip, 0.65 * high), (0.0, high)], 14)
     knob = d.real(0.1, 0.2) * lip + 0.02
     lid = turned_body([(0, -0.04), (lip * 1.05, -0.04), *dome[:-1], (0, high)], 40)
-    top = ball(knob).at(z=high + 0.6 * knob) if d.chance(0.7) else soft_box((4 * knob, knob, knob), 0.3).at(z=high - 0.02)
+    top = (
+        ball(knob).at(z=high + 0.6 * knob) if d.chance(0.7) else soft_box((4 * knob, knob, knob), 0.3).at(z=high - 0.02)
+    )
     return [lid, top]
 
 
@@ -248,7 +257,9 @@ def stack(d: Dice) -> list[Piece]:
             z += high + 0.2 * r - 0.15 * r
         elif kind == "torus":
             thick = 0.3 * r
-            found += pieces(role, ring(r - thick, thick).at(z=z + 0.6 * thick), cylinder(r - thick, 1.6 * thick).at(z=z - 0.02))
+            found += pieces(
+                role, ring(r - thick, thick).at(z=z + 0.6 * thick), cylinder(r - thick, 1.6 * thick).at(z=z - 0.02)
+            )
             z += 1.55 * thick
         elif kind == "side":
             side = profiles.turned_side(d, high, r)

@@ -50,7 +50,9 @@ def bent(d: Dice) -> list[Piece]:
     arc = np.linspace(0, np.pi, 14)
     if kind == "hook":
         r, long = 0.5, d.log(0.8, 3)
-        path = np.concatenate([[(r, 0, long)], [(r * np.cos(a), 0, -r * np.sin(a)) for a in arc], [(-r, 0, d.real(0.05, 0.6))]])
+        path = np.concatenate(
+            [[(r, 0, long)], [(r * np.cos(a), 0, -r * np.sin(a)) for a in arc], [(-r, 0, d.real(0.05, 0.6))]]
+        )
     elif kind == "s":
         r = d.real(0.4, 0.7)
         up = np.array([(r * np.sin(a) * 1.0, 0, r * np.cos(a) + r) for a in np.linspace(-1.9, np.pi, 18)])
@@ -65,7 +67,9 @@ def bent(d: Dice) -> list[Piece]:
         path = _soft(sharp, 0.25)
     elif kind == "handle":
         w, h = d.real(0.7, 1.5), d.real(0.3, 0.8)
-        path = _soft(np.array([(-w, 0, 0), (-w * d.real(0.8, 1), 0, h), (w * d.real(0.8, 1), 0, h), (w, 0, 0)]), d.real(0.1, 0.4))
+        path = _soft(
+            np.array([(-w, 0, 0), (-w * d.real(0.8, 1), 0, h), (w * d.real(0.8, 1), 0, h), (w, 0, 0)]), d.real(0.1, 0.4)
+        )
     elif kind == "question":
         r = 0.6
         bow = [(r * np.cos(a), 0, r * np.sin(a)) for a in np.linspace(np.pi * 0.95, -0.6, 16)]
@@ -206,7 +210,10 @@ def cage(d: Dice) -> list[Piece]:
         n, levels, high = d.whole(6, 16), d.whole(2, 4), d.log(0.6, 2.5)
         flare = d.real(0.6, 1.4)
         radii = np.linspace(1, flare, levels)
-        found = [Piece(ring(float(r), 1.6 * thin, segments=32, sides=10).at(z=z), "rings") for r, z in zip(radii, np.linspace(0, high, levels), strict=True)]
+        found = [
+            Piece(ring(float(r), 1.6 * thin, segments=32, sides=10).at(z=z), "rings")
+            for r, z in zip(radii, np.linspace(0, high, levels), strict=True)
+        ]
         post = tube([(1, 0, 0), (flare, 0, high)], thin, sides=8)
         found += pieces("bars", *around(post, n))
         if d.chance(0.5):
@@ -223,7 +230,11 @@ def cage(d: Dice) -> list[Piece]:
     round_bars = d.chance(0.5)
     post = tube([(0, 0, 0), (0, 0, 2 * h)], thick, sides=12) if round_bars else block((2 * thick, 2 * thick, 2 * h))
     found = pieces("rails", *both(post.at(x=w)))
-    rung = tube([(-w, 0, 0), (w, 0, 0)], thin, sides=10) if round_bars else block((2 * w, 1.5 * thin, 3 * thin)).at(z=-1.5 * thin)
+    rung = (
+        tube([(-w, 0, 0), (w, 0, 0)], thin, sides=10)
+        if round_bars
+        else block((2 * w, 1.5 * thin, 3 * thin)).at(z=-1.5 * thin)
+    )
     found += [Piece(rung.at(z=z), "bars") for z in np.linspace(0.12 * h, 1.88 * h, n)]
     if d.chance(0.4):  # a rack: the same again behind it
         deep = d.real(0.4, 1.2)
@@ -258,7 +269,11 @@ def bars_star(d: Dice) -> list[Piece]:
         found += pieces("ends", *around(tip, n)) if d.chance(0.6) else []
         return found
     root, tip_w = d.real(0.08, 0.2), d.real(0.12, 0.4)
-    blade = extrude(outlines.rounded(np.array([(-root, 0), (root, 0), (tip_w, 1.0), (-0.6 * tip_w, 0.95)]), 0.2, 5), 0.05, bevel=0.012)
+    blade = extrude(
+        outlines.rounded(np.array([(-root, 0), (root, 0), (tip_w, 1.0), (-0.6 * tip_w, 0.95)]), 0.2, 5),
+        0.05,
+        bevel=0.012,
+    )
     blade = blade.at(z=-0.025).turned(1, d.real(15, 45)).at(y=0.6 * hub)
     found += pieces("bars", *around(blade, max(n, 2)))
     if kind == "fan":
@@ -269,7 +284,9 @@ def bars_star(d: Dice) -> list[Piece]:
         if d.chance(0.6):
             stand = d.real(0.5, 1.5)
             found = [Piece(p.mesh.turned(0, 90).at(z=r + stand), p.role) for p in found]
-            found += pieces("frame", cylinder(0.07, stand + 0.05), cylinder(d.real(0.5, 0.8), 0.1, bevel=0.03).at(z=-0.05))
+            found += pieces(
+                "frame", cylinder(0.07, stand + 0.05), cylinder(d.real(0.5, 0.8), 0.1, bevel=0.03).at(z=-0.05)
+            )
     return found
 
 
