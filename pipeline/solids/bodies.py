@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -57,8 +58,8 @@ def extrude(
         plane = (ring * (1 + (end_scale - 1) * z)) @ np.array([[c, s], [-s, c]])
         points.append(np.concatenate([plane, np.full((len(plane), 1), height * z)], axis=1))
     end = rings[0][1]
-    cap = triangulate(end[: starts[1]], [end[a:b] for a, b in zip(starts[1:-1], starts[2:], strict=True)])
-    ahead = np.concatenate([np.roll(np.arange(a, b), -1) for a, b in zip(starts[:-1], starts[1:], strict=True)])
+    cap = triangulate(end[: starts[1]], [end[a:b] for a, b in pairwise(starts[1:])])
+    ahead = np.concatenate([np.roll(np.arange(a, b), -1) for a, b in pairwise(starts)])
     return _tube(np.stack(points), ahead, cap)
 
 

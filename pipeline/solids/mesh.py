@@ -119,8 +119,8 @@ def _edges(mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 def shaded(mesh: Mesh, crease_deg: float = 38.0) -> tuple[Floats, NDArray[np.int64], Floats]:
     """Vertices, faces and unit normals of a mesh: smooth where it bends little, split along sharper edges.
 
-    Faces round a vertex share its normal (the mean by area) as far as they hang together through edges that bend by less
-    than `crease_deg`.
+    Faces round a vertex share its normal (the mean by area) as far as they hang together through edges that bend by
+    less than `crease_deg`.
     """
     n_faces = len(mesh.faces)
     areas = area_vectors(mesh)
@@ -137,12 +137,12 @@ def shaded(mesh: Mesh, crease_deg: float = 38.0) -> tuple[Floats, NDArray[np.int
     ends = [np.where(start[one] == start[two], two, (two + n_faces) % (3 * n_faces))]
     ends.append(np.where(start[one] == start[two], (two + n_faces) % (3 * n_faces), two))
     links = np.concatenate([one, (one + n_faces) % (3 * n_faces)]), np.concatenate(ends)
-    group, corner_of = np.unique(_connected(3 * n_faces, *links), return_inverse=True)
-    corner_of = corner_of.reshape(-1)
+    group, found = np.unique(_connected(3 * n_faces, *links), return_inverse=True)
+    corner_of = found.reshape(-1).astype(np.int64)
     source = np.concatenate([mesh.faces[:, k] for k in range(3)])[group]
-    normals = np.stack([np.bincount(corner_of, np.tile(axis, 3), len(group)) for axis in areas.T], axis=1)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    return mesh.vertices[source], corner_of.reshape(3, -1).T.astype(np.int64), normals
+    sums = np.stack([np.bincount(corner_of, np.tile(axis, 3), len(group)) for axis in areas.T], axis=1)
+    normals = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-300)
+    return mesh.vertices[source], corner_of.reshape(3, -1).T, normals
 
 
 def _connected(count: int, a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.int64]:

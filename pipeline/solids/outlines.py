@@ -163,6 +163,17 @@ def finer(outline: Floats, longest: float) -> Floats:
     return np.concatenate([p + a * np.arange(n)[:, None] / n for p, a, n in zip(outline, ahead, pieces, strict=True)])
 
 
+def shifted(outline: Floats, x: float, y: float) -> Floats:
+    """Moved in the plane."""
+    return outline + np.array([x, y])
+
+
+def around(outline: Floats, radius: float, count: int, start_deg: float = 0.0) -> list[Floats]:
+    """Copies at even angles about the origin, their own origins at a radius."""
+    out = shifted(outline, radius, 0)
+    return [turned(out, start_deg + 360 * k / count) for k in range(count)]
+
+
 def turned(outline: Floats, degrees: float) -> Floats:
     """Turned counter-clockwise about the origin."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,7 @@ def triangulate(outline: Floats, holes: Sequence[Floats] = ()) -> NDArray[np.int
     """
     points = np.concatenate([outline, *holes])
     starts = np.cumsum([0, len(outline), *(len(hole) for hole in holes)])
-    loops = [list(range(a, b)) for a, b in zip(starts[:-1], starts[1:], strict=True)]
+    loops = [list(range(a, b)) for a, b in pairwise(starts)]
     ring, waiting = loops[0], loops[1:]
     # from right to left: a hole's bridge then has the ring, not another hole, nearby
     waiting.sort(key=lambda loop: -points[loop, 0].max())

@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.geometry import Floats
 from pipeline.render.procedural import profiles
-from pipeline.render.procedural.pieces import Dice, Piece, around, in_row, pieces
+from pipeline.render.procedural.pieces import Dice, Piece, in_row, pieces
 from pipeline.solids import outlines
 from pipeline.solids.bodies import ball, block, cylinder, extrude, pipe, ring, soft_box, superquadric, tube, turned_body
 from pipeline.solids.mesh import Mesh
@@ -24,9 +24,9 @@ def assembly(d: Dice) -> list[Piece]:
 def _core(d: Dice) -> Mesh:
     """A body about the z axis without an opening at its top or sides."""
     kind = d.pick(("block", "cylinder", "outline", "turned", "soft", "bar", "super"))
-    w, l, high = d.log(0.5, 1.4), d.log(0.5, 1.4), d.log(0.3, 2.0)
+    w, length, high = d.log(0.5, 1.4), d.log(0.5, 1.4), d.log(0.3, 2.0)
     if kind == "block":
-        return block((w, l, high), bevel=d.pick((0.0, 0.05)))
+        return block((w, length, high), bevel=d.pick((0.0, 0.05)))
     if kind == "cylinder":
         return cylinder(0.5 * w, high, segments=d.pick((36, 36, 6, 8)), bevel=0.03, top=d.pick((1.0, d.real(0.6, 1.0))))
     if kind == "outline":
@@ -34,12 +34,15 @@ def _core(d: Dice) -> Mesh:
     if kind == "turned":
         return turned_body(profiles.closed_profile(profiles.turned_side(d, high, 0.5 * w), 0.02), 36)
     if kind == "soft":
-        return soft_box((w, l, high), d.real(0.1, 0.45))
+        return soft_box((w, length, high), d.real(0.1, 0.45))
     if kind == "bar":
         return (
-            cylinder(0.5 * min(w, high), 2 * l, segments=28, bevel=0.03).at(z=-l).turned(1, 90).at(z=0.5 * min(w, high))
+            cylinder(0.5 * min(w, high), 2 * length, segments=28, bevel=0.03)
+            .at(z=-length)
+            .turned(1, 90)
+            .at(z=0.5 * min(w, high))
         )
-    return superquadric((0.5 * w, 0.5 * l, 0.5 * high), 4, 3, rows=18, columns=32).at(z=0.5 * high)
+    return superquadric((0.5 * w, 0.5 * length, 0.5 * high), 4, 3, rows=18, columns=32).at(z=0.5 * high)
 
 
 def _features(d: Dice, core: Mesh, depth: int) -> list[Mesh]:
@@ -88,12 +91,12 @@ def _features(d: Dice, core: Mesh, depth: int) -> list[Mesh]:
         directions = [360.0 * k / n for k in range(n)]
     else:
         directions = [0.0, 180.0] if d.chance(0.7) else [d.pick((0.0, 90.0))]
-    found = []
-    for turn in directions:
-        outwards = np.array([np.cos(np.radians(turn)), np.sin(np.radians(turn)), 0.0])
+    found: list[Mesh] = []
+    for degrees in directions:
+        outwards = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0.0])
         place = _hit(core, np.array([middle[0], middle[1], low[2] + level]) + 5 * outwards, -outwards)
         if place is not None:
-            found += [m.turned(1, 90).turned(2, turn).at(*place) for m in made]
+            found += [m.turned(1, 90).turned(2, degrees).at(*place) for m in made]
     return found
 
 
@@ -129,7 +132,7 @@ def _feature(d: Dice, size: float, depth: int) -> list[Mesh]:
     if kind == "port":
         long = d.log(0.5, 2.0) * size
         tube_ = pipe(0.62 * r, 0.42 * r, long - sink, segments=24).at(z=sink)
-        holes = [outlines.turned(outlines.circle(0.09 * r, 8) + (0.8 * r, 0), 60 * k) for k in range(6)]
+        holes = outlines.around(outlines.circle(0.09 * r, 8), 0.8 * r, 6)
         rim = extrude(outlines.circle(r, 32), 0.2 * r, holes=[outlines.circle(0.42 * r, 24), *holes]).at(
             z=long - 0.19 * r
         )
@@ -185,6 +188,3 @@ def _hit(mesh: Mesh, origin: Floats, direction: Floats) -> Floats | None:
         t = (e2 * q).sum(1) / det
         hits = t[(np.abs(det) > 1e-15) & (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)]
     return None if not len(hits) else origin + hits.min() * direction
-
-
-__all__ = ["around", "assembly"]

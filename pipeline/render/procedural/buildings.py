@@ -52,7 +52,7 @@ def arch(d: Dice) -> list[Piece]:
     else:
         outer = [(-out, up + out), (out, up + out)]
     shape = np.array([(w, 0), *inner, (-w, 0), (-out, 0), *outer, (out, 0)])[::-1]
-    shape = profiles._without_repeats(shape)
+    shape = profiles.without_repeats(shape)
     body = extrude(shape, deep, bevel=d.pick((0.0, 0.02))).turned(0, 90).at(y=0.5 * deep)
     found = pieces("body", body)
     if d.chance(0.5):
@@ -60,7 +60,7 @@ def arch(d: Dice) -> list[Piece]:
         found += pieces("base", *both(foot))
     if d.chance(0.5):
         fill = np.array([(w + 0.01, 0), *inner, (-w - 0.01, 0)])
-        fill = profiles._without_repeats(fill)
+        fill = profiles.without_repeats(fill)
         found += pieces("door", extrude(fill, 0.4 * deep).turned(0, 90).at(y=0.2 * deep))
         if d.chance(0.6):
             found += pieces("knob", ball(0.06, count=12).at(0.6 * w, -0.22 * deep - 0.02, 0.5 * up))
@@ -88,12 +88,12 @@ def stairs(d: Dice) -> list[Piece]:
         points += [(n * run, 0.0)]
     else:
         points += [(n * run, (n - 1) * rise - 0.1), (1.5 * run, 0.0)]
-    shape = profiles._without_repeats(np.array(points))[::-1]
+    shape = profiles.without_repeats(np.array(points))[::-1]
     found = pieces("body", extrude(shape, w).turned(0, 90).at(y=0.5 * w))
     if d.chance(0.5):
         tall = d.real(0.5, 0.9)
         ends = [(0.5 * run, 0.42 * w, rise), ((n - 0.5) * run, 0.42 * w, n * rise)]
-        rail = tube_between(np.array(ends) + (0, 0, tall), 0.04)
+        rail = tube_between(np.array(ends) + np.array([0, 0, tall]), 0.04)
         posts = [
             block((0.05, 0.05, tall + 0.02)).at((k + 0.5) * run, 0.42 * w, (k + 1) * rise - 0.01) for k in range(n)
         ]
@@ -108,8 +108,8 @@ def tube_between(ends: np.ndarray, radius: float) -> Mesh:
 
 def house(d: Dice) -> list[Piece]:
     """Houses, barns, kennels, chapels: walls, a roof of some form, chimney, door, windows, porch, tower."""
-    w, l, high = d.real(0.8, 1.4), d.log(0.9, 2.2), d.log(0.4, 1.5)
-    found = pieces("walls", block((w, l, high)))
+    w, length, high = d.real(0.8, 1.4), d.log(0.9, 2.2), d.log(0.4, 1.5)
+    found = pieces("walls", block((w, length, high)))
     roof = d.pick(("gable", "gable", "hip", "flat", "shed", "barrel"))
     over = d.real(0.04, 0.16)
     peak = d.real(0.3, 0.8) * w
@@ -117,30 +117,38 @@ def house(d: Dice) -> list[Piece]:
     if roof == "gable":
         t = 0.1
         shape = np.array([(-half, 0), (half, 0), (half, t), (0, peak + t), (-half, t)])
-        found += pieces("roof", extrude(shape, l + 2 * over).turned(0, 90).at(y=0.5 * l + over, z=high - 0.02))
+        found += pieces(
+            "roof", extrude(shape, length + 2 * over).turned(0, 90).at(y=0.5 * length + over, z=high - 0.02)
+        )
     elif roof == "hip":
-        body = extrude(outlines.rectangle(w + 2 * over, l + 2 * over), peak, top=(0.05, max(0.05, 1 - w / l)))
-        found += pieces("roof", block((w + 2 * over, l + 2 * over, 0.06)).at(z=high - 0.02), body.at(z=high + 0.03))
+        body = extrude(outlines.rectangle(w + 2 * over, length + 2 * over), peak, top=(0.05, max(0.05, 1 - w / length)))
+        found += pieces(
+            "roof", block((w + 2 * over, length + 2 * over, 0.06)).at(z=high - 0.02), body.at(z=high + 0.03)
+        )
     elif roof == "flat":
-        found += pieces("roof", block((w + 2 * over, l + 2 * over, 0.12), bevel=0.02).at(z=high - 0.02))
+        found += pieces("roof", block((w + 2 * over, length + 2 * over, 0.12), bevel=0.02).at(z=high - 0.02))
         if d.chance(0.5):
-            found += pieces("walls", block((0.5 * w, 0.4 * l, d.real(0.2, 0.5))).at(0, 0.1 * l, high + 0.09))
+            found += pieces("walls", block((0.5 * w, 0.4 * length, d.real(0.2, 0.5))).at(0, 0.1 * length, high + 0.09))
     elif roof == "shed":
         shape = np.array([(-half, 0), (half, 0), (half, 0.08), (-half, peak)])
-        found += pieces("roof", extrude(shape, l + 2 * over).turned(0, 90).at(y=0.5 * l + over, z=high - 0.02))
+        found += pieces(
+            "roof", extrude(shape, length + 2 * over).turned(0, 90).at(y=0.5 * length + over, z=high - 0.02)
+        )
     else:
-        shape = profiles._without_repeats(outlines.circle(half, 40)[:21] * (1, peak / half))
-        found += pieces("roof", extrude(shape, l + 2 * over).turned(0, 90).at(y=0.5 * l + over, z=high - 0.02))
+        shape = profiles.without_repeats(outlines.circle(half, 40)[:21] * (1, peak / half))
+        found += pieces(
+            "roof", extrude(shape, length + 2 * over).turned(0, 90).at(y=0.5 * length + over, z=high - 0.02)
+        )
     if d.chance(0.5):
-        found += pieces("chimney", block((0.18, 0.18, peak + 0.4)).at(0.25 * w, 0.25 * l, high))
+        found += pieces("chimney", block((0.18, 0.18, peak + 0.4)).at(0.25 * w, 0.25 * length, high))
     door_high = 0.6 * high
-    found += pieces("door", block((0.22, 0.06, door_high)).at(0, -0.5 * l))
-    window = block((0.16, 0.06, min(0.2, 0.3 * high)), bevel=0.01).at(y=-0.5 * l, z=0.45 * high)
+    found += pieces("door", block((0.22, 0.06, door_high)).at(0, -0.5 * length))
+    window = block((0.16, 0.06, min(0.2, 0.3 * high)), bevel=0.01).at(y=-0.5 * length, z=0.45 * high)
     if d.chance(0.7):
         found += pieces("windows", *both(window.at(x=0.32 * w)))
         n = d.whole(1, 4)
-        side = block((0.06, 0.4 * l / n, 0.3 * high)).at(x=0.5 * w, z=0.4 * high)
-        found += [Piece(m, "windows") for row in in_row(side, n, (0, 0.85 * l / n, 0)) for m in both(row)]
+        side = block((0.06, 0.4 * length / n, 0.3 * high)).at(x=0.5 * w, z=0.4 * high)
+        found += [Piece(m, "windows") for row in in_row(side, n, (0, 0.85 * length / n, 0)) for m in both(row)]
     if d.chance(0.3):
         r = d.real(0.2, 0.35)
         up = high + peak * d.real(0.6, 1.6)
@@ -149,9 +157,9 @@ def house(d: Dice) -> list[Piece]:
             Piece(cylinder(r, up, segments=sides), "walls"),
             Piece(cylinder(1.2 * r, d.real(0.3, 0.9), top=0.03, segments=sides).at(z=up - 0.01), "roof"),
         ]
-        found += [Piece(p.mesh.turned(2, 45 if sides == 4 else 0).at(0.5 * w, 0.35 * l), p.role) for p in tower]
+        found += [Piece(p.mesh.turned(2, 45 if sides == 4 else 0).at(0.5 * w, 0.35 * length), p.role) for p in tower]
     if d.chance(0.5):
-        found += pieces("base", block((w + 0.3, l + 0.3, 0.1)).at(z=-0.09))
+        found += pieces("base", block((w + 0.3, length + 0.3, 0.1)).at(z=-0.09))
     return found
 
 
@@ -189,8 +197,8 @@ def fence(d: Dice) -> list[Piece]:
         if d.chance(0.6):
             cap = d.pick(
                 (
-                    ball(0.12, count=12).at(z=high * 1.1 + 0.08),
-                    cylinder(0.15, 0.12, top=0.1, segments=4).turned(2, 45).at(z=high * 1.1),
+                    ball(0.12, count=12).at(z=high * 1.2),
+                    cylinder(0.15, 0.12, top=0.1, segments=4).turned(2, 45).at(z=high * 1.2 - 0.11),
                 )
             )
             found += pieces("posts", *both(cap.at(x=0.5 * reach)))
@@ -222,7 +230,7 @@ def tiers(d: Dice) -> list[Piece]:
             high = d.real(0.3, 0.6) * r
             found += pieces("body", cylinder(0.7 * r, high, segments=sides).at(z=z))
             found += pieces("roof", cylinder(1.1 * r, 0.35 * r, top=0.4, segments=sides).at(z=z + high - 0.01))
-            z, r = z + high + 0.33 * r, r * d.real(0.65, 0.85)
+            z, r = z + high + 0.3 * r, r * d.real(0.65, 0.85)
         else:
             high = d.log(0.3, 2.0)
             found += pieces("body", cylinder(r, high, segments=sides).at(z=z))

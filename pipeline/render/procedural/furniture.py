@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.render.procedural import profiles
-from pipeline.render.procedural.pieces import Dice, Piece, both, corners, in_grid, in_row, pieces
+from pipeline.render.procedural.pieces import Dice, Piece, both, corners, in_row, pieces
 from pipeline.solids import outlines
-from pipeline.solids.bodies import along, ball, block, cylinder, extrude, ring, soft_box, tube, turned_body
+from pipeline.solids.bodies import along, ball, block, cylinder, extrude, soft_box, tube, turned_body
 from pipeline.solids.mesh import Mesh
 
 
@@ -24,26 +24,28 @@ def _leg(d: Dice, high: float, thick: float) -> Mesh:
     return turned_body(profiles.closed_profile(side), 20)
 
 
-def _top(d: Dice, w: float, l: float, thick: float) -> Mesh:
+def _top(d: Dice, w: float, length: float, thick: float) -> Mesh:
     kind = d.pick(("box", "box", "rounded", "oval", "soft"))
     if kind == "box":
-        return block((w, l, thick), bevel=d.pick((0.0, 0.2 * thick)))
+        return block((w, length, thick), bevel=d.pick((0.0, 0.2 * thick)))
     if kind == "rounded":
         return extrude(
-            outlines.rounded(outlines.rectangle(w, l), d.real(0.1, 0.45) * min(w, l), 6), thick, bevel=0.2 * thick
+            outlines.rounded(outlines.rectangle(w, length), d.real(0.1, 0.45) * min(w, length), 6),
+            thick,
+            bevel=0.2 * thick,
         )
     if kind == "oval":
-        return extrude(outlines.superellipse(w, l, d.real(2, 4)), thick, bevel=0.2 * thick)
-    return soft_box((w, l, thick), 0.35)
+        return extrude(outlines.superellipse(w, length, d.real(2, 4)), thick, bevel=0.2 * thick)
+    return soft_box((w, length, thick), 0.35)
 
 
 def table(d: Dice) -> list[Piece]:
     """Tables, desks, benches, stools: a top on legs, a pedestal or slabs, with rails, shelves, drawers."""
-    w, l, high = 2.0, 2.0 * d.log(0.3, 1.0), d.log(0.4, 3.0)
+    w, length, high = 2.0, 2.0 * d.log(0.3, 1.0), d.log(0.4, 3.0)
     thick, leg = d.real(0.06, 0.25), d.real(0.06, 0.14)
-    found = pieces("top", _top(d, w, l, thick).at(z=high))
+    found = pieces("top", _top(d, w, length, thick).at(z=high))
     stand = d.pick(("legs", "legs", "legs", "pedestal", "slabs", "trestle", "splayed"))
-    x, y = 0.5 * w * d.real(0.7, 0.9) - leg, 0.5 * l * d.real(0.7, 0.9) - leg
+    x, y = 0.5 * w * d.real(0.7, 0.9) - leg, 0.5 * length * d.real(0.7, 0.9) - leg
     x, y = max(x, 1.1 * leg), max(y, 1.1 * leg)
     if stand == "legs":
         found += pieces("legs", *corners(_leg(d, high + 0.02, leg).at(x, y)))
@@ -60,13 +62,13 @@ def table(d: Dice) -> list[Piece]:
     elif stand == "pedestal":
         side = profiles.turned_side(d, high + 0.02, d.real(0.15, 0.3))
         found += pieces("legs", turned_body(profiles.closed_profile(side), 28))
-        found += pieces("foot", cylinder(d.real(0.45, 0.8) * min(1, l), 0.12, top=0.8, bevel=0.02))
+        found += pieces("foot", cylinder(d.real(0.45, 0.8) * min(1, length), 0.12, top=0.8, bevel=0.02))
     elif stand == "slabs":
-        found += pieces("legs", *both(block((1.4 * leg, 0.9 * l, high + 0.01)).at(x=x)))
+        found += pieces("legs", *both(block((1.4 * leg, 0.9 * length, high + 0.01)).at(x=x)))
         if d.chance(0.6):
             found += pieces("frame", block((2 * x, 1.2 * leg, 0.5 * high)).at(z=0.4 * high))
     else:
-        foot = block((2 * leg, 0.9 * l, 1.4 * leg), bevel=0.02)
+        foot = block((2 * leg, 0.9 * length, 1.4 * leg), bevel=0.02)
         found += pieces("legs", *both(foot.at(x=x)), *both(block((1.3 * leg, 2.4 * leg, high + 0.01)).at(x=x)))
         found += pieces("frame", block((2 * x, 0.8 * leg, 1.6 * leg)).at(z=0.35 * high))
     return found
@@ -74,22 +76,24 @@ def table(d: Dice) -> list[Piece]:
 
 def seat(d: Dice) -> list[Piece]:
     """Chairs, armchairs, sofas, stools with backs."""
-    w, l, high = d.pick((1.0, 1.0, d.log(1.0, 2.6))), d.real(0.85, 1.1), d.real(0.35, 1.0)
+    w, length, high = d.pick((1.0, 1.0, d.log(1.0, 2.6))), d.real(0.85, 1.1), d.real(0.35, 1.0)
     if d.chance(0.35):  # upholstered
         thick, arm = d.real(0.2, 0.35), d.real(0.15, 0.25)
-        found = pieces("seat", soft_box((w + 0.02, l, 0.3 + thick), 0.12))
+        found = pieces("seat", soft_box((w + 0.02, length, 0.3 + thick), 0.12))
         n = max(1, round(w / 0.9))
-        cushion = soft_box((w / n * 0.97, l * 0.85, 0.22), 0.4)
+        cushion = soft_box((w / n * 0.97, length * 0.85, 0.22), 0.4)
         found += pieces("cushions", *in_row(cushion.at(y=-0.05, z=0.28 + thick), n, (w / n, 0, 0)))
-        found += pieces("seat", soft_box((w + 2 * arm, 0.28, d.real(0.9, 1.4)), 0.3).at(y=0.5 * l))
-        found += pieces("seat", *both(soft_box((arm, l * 1.05, d.real(0.65, 0.85)), 0.35).at(x=0.5 * w + 0.45 * arm)))
-        foot = cylinder(0.06, 0.16, top=1.3, segments=14).at(0.5 * w - 0.05, 0.4 * l, -0.14)
+        found += pieces("seat", soft_box((w + 2 * arm, 0.28, d.real(0.9, 1.4)), 0.3).at(y=0.5 * length))
+        found += pieces(
+            "seat", *both(soft_box((arm, length * 1.05, d.real(0.65, 0.85)), 0.35).at(x=0.5 * w + 0.45 * arm))
+        )
+        foot = cylinder(0.06, 0.16, top=1.3, segments=14).at(0.5 * w - 0.05, 0.4 * length, -0.14)
         return found + pieces("legs", *corners(foot))
     thick, leg, up = d.real(0.05, 0.14), d.real(0.04, 0.08), d.real(0.5, 1.3)
     kind = d.pick(("panel", "slats", "bars", "bow"))
-    top = soft_box((w, l, thick), 0.35) if kind == "bow" else _top(d, w, l, thick)
+    top = soft_box((w, length, thick), 0.35) if kind == "bow" else _top(d, w, length, thick)
     found = pieces("seat", top.at(z=high))
-    x, y = 0.5 * w - 1.2 * leg, 0.5 * l - 1.2 * leg
+    x, y = 0.5 * w - 1.2 * leg, 0.5 * length - 1.2 * leg
     one = _leg(d, high + 0.02, leg)
     found += pieces("legs", *corners(one.at(x * 0.97, y * 0.97)))
     lean = -d.real(0, 12)
@@ -117,8 +121,8 @@ def seat(d: Dice) -> list[Piece]:
             ]
     found += [Piece(m.turned(0, lean).at(y=y - 0.01, z=high + 0.4 * thick), "back") for m in back]
     if d.chance(0.25):
-        rail = block((0.1, 0.8 * l, 0.06), bevel=0.015).at(x=x, z=high + 0.42)
-        post = block((0.06, 0.06, 0.45)).at(x=x, y=-0.3 * l, z=high)
+        rail = block((0.1, 0.8 * length, 0.06), bevel=0.015).at(x=x, z=high + 0.42)
+        post = block((0.06, 0.06, 0.45)).at(x=x, y=-0.3 * length, z=high)
         found += pieces("arms", *both(rail.at(y=0.1)), *both(post))
     return found
 
@@ -175,29 +179,29 @@ def shelf(d: Dice) -> list[Piece]:
 
 def crate(d: Dice) -> list[Piece]:
     """Boxes, crates of slats, pallets, trays, bins, boxes with lids and bands."""
-    w, l, high = d.log(0.8, 2.0), d.log(0.8, 1.6), d.log(0.3, 1.6)
+    w, length, high = d.log(0.8, 2.0), d.log(0.8, 1.6), d.log(0.3, 1.6)
     t = d.real(0.04, 0.1)
     kind = d.pick(("slats", "pallet", "tray", "box", "bin"))
     if kind == "slats":
         n = d.whole(2, 5)
-        found = pieces("posts", *corners(block((1.6 * t, 1.6 * t, high)).at(0.5 * w - 1.3 * t, 0.5 * l - 1.3 * t)))
+        found = pieces("posts", *corners(block((1.6 * t, 1.6 * t, high)).at(0.5 * w - 1.3 * t, 0.5 * length - 1.3 * t)))
         pitch = high / n
         slat = 0.75 * pitch
         for z in np.arange(n) * pitch + 0.1 * pitch:
-            found += pieces("slats", *both(block((w, t, slat)).at(y=0.5 * l - 0.2 * t, z=z), 1))
-            found += pieces("slats", *both(block((t, l - t, slat)).at(x=0.5 * w - 0.2 * t, z=z + 0.003)))
-        return found + pieces("slats", block((w - t, l - t, t)).at(z=0.02))
+            found += pieces("slats", *both(block((w, t, slat)).at(y=0.5 * length - 0.2 * t, z=z), 1))
+            found += pieces("slats", *both(block((t, length - t, slat)).at(x=0.5 * w - 0.2 * t, z=z + 0.003)))
+        return found + pieces("slats", block((w - t, length - t, t)).at(z=0.02))
     if kind == "pallet":
         n, deck = d.whole(4, 9), d.real(0.05, 0.08)
-        board = block((w / n * d.real(0.65, 0.92), l, deck))
+        board = block((w / n * d.real(0.65, 0.92), length, deck))
         found = pieces("slats", *in_row(board.at(z=0.3), n, (w / n, 0, 0)))
-        found += pieces("posts", *in_row(block((w * 0.999, 0.14, 0.26)).at(z=0.05), 3, (0, 0.5 * l - 0.08, 0)))
+        found += pieces("posts", *in_row(block((w * 0.999, 0.14, 0.26)).at(z=0.05), 3, (0, 0.5 * length - 0.08, 0)))
         return found + pieces("slats", *in_row(board.at(z=0.0), 3, (0.5 * w - 0.5 * w / n, 0, 0)))
     if kind in ("tray", "bin"):
         shape = d.pick(
             (
-                outlines.rounded(outlines.rectangle(w, l), d.real(0.05, 0.4), 5),
-                outlines.superellipse(w, l, 4),
+                outlines.rounded(outlines.rectangle(w, length), d.real(0.05, 0.4), 5),
+                outlines.superellipse(w, length, 4),
                 outlines.circle(0.5 * w, 36),
             )
         )
@@ -208,34 +212,34 @@ def crate(d: Dice) -> list[Piece]:
             rim = np.concatenate([shape * grow, np.full((len(shape), 1), high)], axis=1)
             found += pieces("rim", along(rim, outlines.circle(0.8 * t, 8), closed=True, up=(0, 0, 1)))
         return found
-    found = pieces("body", block((w, l, high), bevel=d.pick((0.0, 0.04))))
+    found = pieces("body", block((w, length, high), bevel=d.pick((0.0, 0.04))))
     if d.chance(0.6):
-        found += pieces("lid", block((w + 0.08, l + 0.08, d.real(0.1, 0.3)), bevel=0.02).at(z=high - 0.05))
+        found += pieces("lid", block((w + 0.08, length + 0.08, d.real(0.1, 0.3)), bevel=0.02).at(z=high - 0.05))
     if d.chance(0.5):
-        band = block((0.12, l + 0.1, high + 0.05))
+        band = block((0.12, length + 0.1, high + 0.05))
         found += pieces("bands", *both(band.at(x=0.3 * w)))
     if d.chance(0.4):
         grip = along(
             np.array([(-0.2, 0, 0), (-0.2, -0.12, 0), (0.2, -0.12, 0), (0.2, 0, 0)]), outlines.circle(0.03, 10)
         )
-        found += [Piece(m, "grips") for m in both(grip.at(y=-0.5 * l + 0.01, z=0.6 * high), 1)]
+        found += [Piece(m, "grips") for m in both(grip.at(y=-0.5 * length + 0.01, z=0.6 * high), 1)]
     return found
 
 
 def bed(d: Dice) -> list[Piece]:
     """Beds and benches: a frame with a mattress, boards at the ends, pillows."""
-    w, l, high = d.real(0.9, 1.9), 2.1, d.real(0.2, 0.5)
-    found = pieces("frame", block((w, l, 0.16)).at(z=high))
+    w, length, high = d.real(0.9, 1.9), 2.1, d.real(0.2, 0.5)
+    found = pieces("frame", block((w, length, 0.16)).at(z=high))
     soft = d.real(0.2, 0.35)
-    found += pieces("mattress", soft_box((0.95 * w, 0.97 * l, soft), 0.35).at(z=high + 0.12))
+    found += pieces("mattress", soft_box((0.95 * w, 0.97 * length, soft), 0.35).at(z=high + 0.12))
     post = _leg(d, high + 0.1, 0.06)
-    found += pieces("legs", *corners(post.at(0.5 * w - 0.07, 0.5 * l - 0.07)))
+    found += pieces("legs", *corners(post.at(0.5 * w - 0.07, 0.5 * length - 0.07)))
     up = d.real(0.5, 1.2)
-    found += pieces("boards", block((w + 0.04, 0.1, up), bevel=0.02).at(y=0.5 * l, z=high))
+    found += pieces("boards", block((w + 0.04, 0.1, up), bevel=0.02).at(y=0.5 * length, z=high))
     if d.chance(0.6):
-        found += pieces("boards", block((w + 0.04, 0.1, 0.6 * up), bevel=0.02).at(y=-0.5 * l, z=high))
+        found += pieces("boards", block((w + 0.04, 0.1, 0.6 * up), bevel=0.02).at(y=-0.5 * length, z=high))
     n = 1 if w < 1.3 else 2
-    pillow = soft_box((0.8 * w / n, 0.45, 0.18), 0.45).at(y=0.32 * l, z=high + soft + 0.08)
+    pillow = soft_box((0.8 * w / n, 0.45, 0.18), 0.45).at(y=0.32 * length, z=high + soft + 0.08)
     return found + pieces("pillows", *in_row(pillow, n, (0.9 * w / n, 0, 0)))
 
 
@@ -270,6 +274,3 @@ def lamp(d: Dice) -> list[Piece]:
     ]
     head.append(Piece(ball((0.11, 0.11, 0.15)).at(z=tall - 0.16), "bulb"))
     return found + [Piece(p.mesh.at(z=-tall).turned(1, -tilt).at(*tip), p.role) for p in head]
-
-
-__all__ = ["bed", "crate", "in_grid", "lamp", "ring", "seat", "shelf", "table"]

@@ -7,9 +7,9 @@ import numpy as np
 from pipeline.render.procedural import profiles
 from pipeline.render.procedural.pieces import Dice, Piece, around, both, corners, in_row, pieces
 from pipeline.solids import outlines
-from pipeline.solids.bodies import along, block, cylinder, extrude, pipe, ring
+from pipeline.solids.bodies import along, block, cylinder, extrude, pipe, ring, turned_body
 from pipeline.solids.grids import spline
-from pipeline.solids.mesh import Mesh
+from pipeline.solids.mesh import Mesh, merged
 
 
 def plate(d: Dice) -> list[Piece]:
@@ -84,7 +84,7 @@ def gear_shaft(d: Dice) -> list[Piece]:
             if r > 0.6 and d.chance(0.5):
                 n, size = d.whole(3, 6), 0.25 * (0.75 * r - thin)
                 at = 0.5 * (thin + 0.8 * r)
-                holes = [outlines.turned(outlines.circle(size, 12) + (at, 0), 360 * k / n) for k in range(n)]
+                holes = outlines.around(outlines.circle(size, 12), at, n)
             twist = d.pick((0.0, 0.0, d.real(-20, 20)))
             mesh = extrude(shape, wide, holes=holes, twist_deg=twist, levels=3 if twist else 1)
             found += pieces("gear", mesh.at(z=z), cylinder(1.8 * thin, wide + 0.12, segments=24).at(z=z - 0.06))
@@ -118,9 +118,9 @@ def bracket(d: Dice) -> list[Piece]:
     shape = outlines.rounded(outlines.rectangle(wide, high), np.array([1e-9, 1e-9, corner, corner]), 5)
     if d.chance(0.5):
         big = outlines.circle(0.3 * min(wide, high), 28)
-        holes = [big + (0, 0.1 * high)]
+        holes = [outlines.shifted(big, 0, 0.1 * high)]
     else:
-        holes = [hole + (x, 0.15 * high) for x, _ in places]
+        holes = [outlines.shifted(hole, x, 0.15 * high) for x, _ in places]
     wall = extrude(shape, thick, holes=holes).turned(0, 90).at(y=thick, z=0.5 * high)
     found += pieces("body", wall)
     ribs = d.pick((0, 1, 2, 2))
@@ -139,8 +139,6 @@ def bracket(d: Dice) -> list[Piece]:
 
 def bolt(d: Dice, radius: float, long: float) -> Mesh:
     """A shank from z = 0 to `long` and a head on it."""
-    from pipeline.solids.mesh import merged
-
     head = cylinder(1.7 * radius, 1.1 * radius, segments=d.pick((6, 6, 18)), bevel=0.1 * radius)
     return merged([cylinder(radius, long, segments=16), head.at(z=long - 0.02 * radius)])
 
@@ -158,7 +156,7 @@ def fastener(d: Dice) -> list[Piece]:
         side += [(r, (k + 0.5) * pitch), (0.82 * r, (k + 1) * pitch)]
     side += [(r, turns * pitch + 0.05), (r, max(long, turns * pitch + 0.1))]
     top = side[-1][1]
-    found = pieces("shank", profiles_body(side))
+    found = pieces("shank", _turned_side_body(side))
     kind = d.pick(("hex", "hex", "socket", "pan", "sunk", "wing", "eye"))
     if kind == "hex":
         head = extrude(outlines.circle(1.9 * r, 6), 1.2 * r, bevel=0.12 * r)
@@ -166,8 +164,6 @@ def fastener(d: Dice) -> list[Piece]:
         head = extrude(outlines.circle(1.6 * r, 32), 1.7 * r, holes=[outlines.circle(0.85 * r, 6)])
         found += pieces("head", cylinder(1.5 * r, 0.8 * r).at(z=top))
     elif kind == "pan":
-        from pipeline.solids.bodies import turned_body
-
         dome = spline([(2 * r, 0.3 * r), (1.3 * r, 1.1 * r), (0, 1.4 * r)], 10)
         head = turned_body([(0, 0), (2 * r, 0), *dome[:-1], (0, 1.4 * r)], 32)
     elif kind == "sunk":
@@ -194,44 +190,42 @@ def fastener(d: Dice) -> list[Piece]:
     return found
 
 
-def profiles_body(side: list[tuple[float, float]], segments: int = 24) -> Mesh:
+def _turned_side_body(side: list[tuple[float, float]], segments: int = 24) -> Mesh:
     """A turned body with this side, closed on the axis."""
-    from pipeline.solids.bodies import turned_body
-
     return turned_body(profiles.closed_profile(np.array(side)), segments)
 
 
 def mounted(d: Dice) -> list[Piece]:
     """A base plate with bosses, ribs, a housing and bolts on it, mirror-symmetric."""
-    w, l, t = d.real(1.2, 2.4), d.real(1.0, 2.0), d.real(0.1, 0.25)
+    w, length, t = d.real(1.2, 2.4), d.real(1.0, 2.0), d.real(0.1, 0.25)
     hole = outlines.circle(0.07, 12)
     inset = 0.17
-    places = [(x * (0.5 * w - inset), y * (0.5 * l - inset)) for x in (-1, 1) for y in (-1, 1)]
-    shape = outlines.rounded(outlines.rectangle(w, l), d.real(0.05, 0.16), d.pick((1, 4)))
+    places = [(x * (0.5 * w - inset), y * (0.5 * length - inset)) for x in (-1, 1) for y in (-1, 1)]
+    shape = outlines.rounded(outlines.rectangle(w, length), d.real(0.05, 0.16), d.pick((1, 4)))
     found = pieces("base", extrude(shape, t, holes=[hole + p for p in places], bevel=0.02))
     top = t - 0.01
     kind = d.pick(("boss", "bosses", "block", "bearing"))
     if kind == "boss":
-        r, h = d.real(0.25, 0.42) * min(w, l), d.log(0.3, 1.5)
+        r, h = d.real(0.25, 0.42) * min(w, length), d.log(0.3, 1.5)
         found += pieces("body", pipe(r, r * d.real(0.4, 0.8), h).at(z=top))
         n = d.pick((0, 3, 4, 6))
         if n:
-            reach, up = min(0.5 * min(w, l) * 0.95, r + 0.5), h * d.real(0.4, 0.9)
+            reach, up = min(0.5 * min(w, length) * 0.95, r + 0.5), h * d.real(0.4, 0.9)
             tri = np.array([(0.93 * r, 0), (reach, 0), (reach, 0.12 * up), (r, up), (0.93 * r, up)])
             rib = extrude(tri, 0.08).turned(0, 90).at(y=0.04, z=top)
             found += pieces("body", *around(rib, n, 45 if n == 4 else 0))
     elif kind == "bosses":
         r, h = 0.14, d.real(0.2, 0.8)
-        one = pipe(r, 0.5 * r, h, segments=20).at(0.25 * w, 0.2 * l, top)
+        one = pipe(r, 0.5 * r, h, segments=20).at(0.25 * w, 0.2 * length, top)
         found += pieces("body", *corners(one))
         if d.chance(0.6):
             found += pieces(
                 "body",
-                block((0.5 * w - 1.4 * r, 0.08, 0.6 * h)).at(0, 0.2 * l, top),
-                block((0.5 * w - 1.4 * r, 0.08, 0.6 * h)).at(0, -0.2 * l, top),
+                block((0.5 * w - 1.4 * r, 0.08, 0.6 * h)).at(0, 0.2 * length, top),
+                block((0.5 * w - 1.4 * r, 0.08, 0.6 * h)).at(0, -0.2 * length, top),
             )
     elif kind == "block":
-        bw, bl, h = w * d.real(0.35, 0.6), l * d.real(0.35, 0.75), d.log(0.3, 1.4)
+        bw, bl, h = w * d.real(0.35, 0.6), length * d.real(0.35, 0.75), d.log(0.3, 1.4)
         found += pieces("body", block((bw, bl, h), bevel=0.05).at(z=top))
         n = d.whole(2, 6)
         fin = block((0.4 * bw / n, bl * 1.02, d.real(0.1, 0.4)))
@@ -240,12 +234,10 @@ def mounted(d: Dice) -> list[Piece]:
         else:
             found += pieces("fins", cylinder(0.3 * min(bw, bl), d.real(0.2, 0.8), bevel=0.02).at(z=top + h - 0.02))
     else:
-        r, thick = d.real(0.35, 0.55) * min(w, 1.6) * 0.7, d.real(0.25, 0.6) * l
+        r, thick = d.real(0.35, 0.55) * min(w, 1.6) * 0.7, d.real(0.25, 0.6) * length
         up = r * d.real(1.2, 1.8)
-        arch = np.concatenate([[(-1.25 * r, 0), (1.25 * r, 0)], outlines.circle(r, 48)[:25] * 1.25 + (0, up)])
-        body = extrude(
-            profiles._without_repeats(arch), thick, holes=[outlines.circle(0.7 * r, 28) + (0, up)], bevel=0.02
-        )
+        arch = np.concatenate([[(-1.25 * r, 0), (1.25 * r, 0)], outlines.circle(1.25 * r, 48, (0, up))[:25]])
+        body = extrude(profiles.without_repeats(arch), thick, holes=[outlines.circle(0.7 * r, 28, (0, up))], bevel=0.02)
         found += pieces("body", body.turned(0, 90).at(y=0.5 * thick, z=top))
         if d.chance(0.6):
             axle = cylinder(0.72 * r, thick * d.real(1.4, 3.0), bevel=0.02)

@@ -32,7 +32,7 @@ def turned_side(d: Dice, height: float, radius: float) -> Floats:
     side = np.array(points)
     if symmetric:
         side = np.concatenate([side, (side * (1, -1) + (0, height))[::-1]])
-    return _without_repeats(side)
+    return without_repeats(side)
 
 
 def _element(d: Dice, r: float, after: float, z: float, length: float) -> list[tuple[float, float]]:
@@ -64,7 +64,8 @@ def _element(d: Dice, r: float, after: float, z: float, length: float) -> list[t
     return [(x, y) for x, y in spline([(r, z), (middle, z + 0.5 * length), (after, top)], 12)]
 
 
-def _without_repeats(side: Floats) -> Floats:
+def without_repeats(side: Floats) -> Floats:
+    """A polyline without steps of no length."""
     step = np.linalg.norm(np.diff(side, axis=0), axis=1)
     return side[np.concatenate([[True], step > 1e-4 * np.abs(side).max()])]
 
@@ -81,7 +82,7 @@ def closed_profile(side: Floats, fillet: float = 0.0, steps: int = 3) -> Floats:
 
 def cup_profile(side: Floats, wall: float, floor: float) -> Floats:
     """The closed profile of a vessel with this outer side: round the lip and down inside to the floor."""
-    inner = _without_repeats(np.maximum(side - (wall, 0), 0.3 * wall))
+    inner = without_repeats(np.maximum(side - (wall, 0), 0.3 * wall))
     inner = inner[inner[:, 1] > side[0, 1] + floor]
     low = np.interp(side[0, 1] + floor, side[:, 1], np.maximum(side[:, 0] - wall, 0.3 * wall))
     lip = [(side[-1, 0] - 0.5 * wall, side[-1, 1] + 0.3 * wall)]
@@ -188,7 +189,7 @@ def _stepped(d: Dice) -> Floats:
     for z in np.linspace(-1, 1, n + 1)[:-1]:
         half += [(x, z), (x if d.chance(0.7) else d.real(0.25, 1.0), z + 2 / n)]
         x = d.real(0.25, 1.0)
-    right = _without_repeats(np.array(half))
+    right = without_repeats(np.array(half))
     return _maybe_round(d, np.concatenate([right, (right * (-1, 1))[::-1]]), 0.08)
 
 
@@ -235,7 +236,7 @@ def hole_pattern(d: Dice, shape: Floats, margin: float) -> list[Floats]:
         if size > 0.02:
             one = _hole(d, size)
             start = d.pick((0.0, 180.0 / n))
-            holes += [outlines.turned(one + (radius, 0), start + 360 * k / n) for k in range(n)]
+            holes += outlines.around(one, radius, n, start)
     if kind == "grid":
         low, high = shape.min(0), shape.max(0)
         pitch = inner * d.real(0.45, 0.9)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from dope.common import seeds
-from pipeline.render.procedural import assembly, buildings, furniture, plates, soft, tools, turned, wires
+from pipeline.render.procedural import assembly, buildings, devices, furniture, plates, soft, tools, turned, wires
 from pipeline.render.procedural.pieces import Dice, Piece
 from pipeline.render.scene import Model, Part
 from pipeline.solids.mesh import Mesh, area_vectors, merged, outward, shaded, subdivided
@@ -54,9 +54,9 @@ KINDS: dict[str, tuple[Kind, float]] = {
     "hand tool": (tools.hand_tool, 1.5),
     "flat tool": (tools.spanner, 1),
     "weights": (tools.weights, 0.6),
-    "device": (tools.device, 1.2),
-    "vehicle": (tools.vehicle, 0.8),
-    "canopy": (tools.umbrella, 0.8),
+    "device": (devices.device, 1.2),
+    "vehicle": (devices.vehicle, 0.8),
+    "canopy": (turned.canopy, 0.8),
     "column": (buildings.column, 0.6),
     "arch": (buildings.arch, 0.7),
     "stairs": (buildings.stairs, 0.7),
@@ -95,8 +95,11 @@ def _model(d: Dice, found: list[Piece]) -> Model | None:
     count = sum(len(piece.mesh.faces) for piece in found)
     if count > FACES[1]:
         return None
-    stretch = np.exp(d.rng.normal(0, 0.15, 3))  # proportions no recipe thought of
-    meshes = [outward(piece.mesh.scaled(stretch)) for piece in found]
+    meshes = [piece.mesh for piece in found]
+    if d.chance(0.3):  # proportions no recipe thought of
+        stretch = np.exp(d.rng.normal(0, 0.2, 3))
+        meshes = [mesh.scaled(stretch) for mesh in meshes]
+    meshes = [outward(mesh) for mesh in meshes]
     while count < FACES[0]:
         meshes, count = [subdivided(mesh) for mesh in meshes], 4 * count
     points = np.concatenate([mesh.vertices for mesh in meshes])

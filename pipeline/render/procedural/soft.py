@@ -121,8 +121,8 @@ def soft_group(d: Dice) -> list[Piece]:
         found += pieces("trim", *both(arm.turned(1, d.real(-50, 50)).at(x=core[0] + 0.4 * long)))
         found += pieces("trim", ball(0.7 * min(core)).at(z=core[2] + 0.3 * min(core)))
         if d.chance(0.5):
-            leg = superquadric((size, size, long), 2.0, 3.0, rows=16, columns=28)
-            found += pieces("trim", *both(leg.at(x=0.5 * core[0], z=-0.8 * core[2] - 0.5 * long)))
+            foot = superquadric((size, size, long), 2.0, 3.0, rows=16, columns=28)
+            found += pieces("trim", *both(foot.at(x=0.5 * core[0], z=-0.8 * core[2] - 0.5 * long)))
     elif style == "ring":
         n = d.whole(3, 9)
         one = ball((size, size, size * d.real(0.6, 1.6)), count=12).at(x=max(core[0], core[1]) * 0.95)
@@ -135,7 +135,7 @@ def soft_group(d: Dice) -> list[Piece]:
         found += pieces("legs", *[m for half in both(leg, 0) for m in both(half, 1)])
         if d.chance(0.6):
             head = 0.6 * min(core)
-            found += pieces("trim", ball(head).at(x=core[0] + 0.4 * head, z=0.7 * core[2]))
+            found += pieces("trim", ball(head).at(x=core[0] + 0.2 * head, z=0.15 * core[2]))
     else:
         n = d.whole(2, 5)
         body = superquadric(core, _power(d), _power(d), rows=18, columns=32)

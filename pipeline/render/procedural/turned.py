@@ -8,7 +8,7 @@ from pipeline.geometry import Floats
 from pipeline.render.procedural import profiles
 from pipeline.render.procedural.pieces import Dice, Piece, around, both, pieces
 from pipeline.solids import outlines
-from pipeline.solids.bodies import ball, cylinder, extrude, ring, soft_box, tube, turned_body
+from pipeline.solids.bodies import ball, cylinder, extrude, ring, soft_box, superquadric, tube, turned_body
 from pipeline.solids.grids import spline
 from pipeline.solids.mesh import Mesh
 
@@ -101,7 +101,7 @@ def _ring_section(d: Dice, inner: float, outer: float, wide: float) -> Floats:
 def _ring_of_holes(d: Dice, radius: float, size: float) -> list[Floats]:
     n = d.whole(3, 8)
     size = min(size, 0.8 * radius * float(np.sin(np.pi / n)))
-    return [outlines.turned(outlines.circle(size, 14) + (radius, 0), 360 * k / n) for k in range(n)]
+    return outlines.around(outlines.circle(size, 14), radius, n)
 
 
 def _vessel_side(d: Dice, height: float) -> Floats:
@@ -128,7 +128,7 @@ def _vessel_side(d: Dice, height: float) -> Floats:
         straight = [(1.0, 0.0), (1.0, up)]
         bend = spline([(1.0, up), (0.85, up + 0.1 * height), (neck, up + 0.2 * height), (neck, height)], 14)
         bend[:, 0] = np.minimum(bend[:, 0], 1.0)
-        return profiles._without_repeats(np.concatenate([straight, bend]))
+        return profiles.without_repeats(np.concatenate([straight, bend]))
     side = spline(points, 20)
     side[:, 0] = np.maximum(side[:, 0], 0.15)
     return side
@@ -258,7 +258,9 @@ def stack(d: Dice) -> list[Piece]:
         elif kind == "torus":
             thick = 0.3 * r
             found += pieces(
-                role, ring(r - thick, thick).at(z=z + 0.6 * thick), cylinder(r - thick, 1.6 * thick).at(z=z - 0.02)
+                role,
+                ring(r - thick, thick).at(z=z + 0.6 * thick),
+                cylinder(r - thick, 1.6 * thick + 0.02).at(z=z - 0.02),
             )
             z += 1.55 * thick
         elif kind == "side":
@@ -272,4 +274,43 @@ def stack(d: Dice) -> list[Piece]:
             z, r = z + high, r * top
         z -= 0.01 * r
         r *= d.real(0.55, 1.1)
+    return found
+
+
+def canopy(d: Dice) -> list[Piece]:
+    """Things with a canopy on a stem: umbrellas, mushrooms, parasols, trees, pins, balloons, lollipops."""
+    high = d.log(0.6, 2.5)
+    r = d.real(0.5, 1.1) * min(1.0, high)
+    thin = d.real(0.04, 0.25)
+    stem = spline([(thin * d.real(1, 1.6), 0), (thin, 0.4 * high), (thin, high + 0.05)], 10)
+    found = pieces("stem", turned_body(profiles.closed_profile(stem), 20))
+    kind = d.pick(("cap", "cone", "ball", "tiers", "panels", "disc"))
+    if kind == "cap":
+        up = d.real(0.3, 0.9) * r
+        dome = spline([(r, 0), (0.8 * r, 0.6 * up), (0.0, up)], 14)
+        under: Floats = np.array([(0, 0.1 * up), (0.85 * r, -0.02)])
+        found += pieces("cap", turned_body(np.concatenate([under, dome[:-1], [(0, up)]]), 40).at(z=high))
+    elif kind == "cone":
+        found += pieces("cap", cylinder(r, d.log(0.5, 2.2), top=0.02, segments=d.pick((36, 6, 8))).at(z=high))
+    elif kind == "ball":
+        found += pieces("cap", superquadric((r, r, r * d.real(0.6, 1.5)), 2, d.pick((2, 2, 3))).at(z=high + 0.55 * r))
+    elif kind == "tiers":
+        n = d.whole(2, 5)
+        z = high
+        for k in range(n):
+            rr = r * (1 - 0.75 * k / n)
+            found += pieces("cap", cylinder(rr, 0.7 * rr + 0.1, top=0.3, segments=d.pick((32, 32))).at(z=z))
+            z += 0.45 * rr + 0.05
+    elif kind == "panels":
+        n = d.whole(6, 10)
+        shape = outlines.circle(1, n)
+        found += pieces("cap", extrude(shape * r, 0.45 * r, top=0.05).at(z=high - 0.1))
+        rib = tube([(r * 0.98, 0, high - 0.1), (0, 0, high + 0.36 * r)], 0.02, sides=8)
+        found += pieces("ribs", *around(rib, n), ball(0.06, count=10).at(z=high + 0.37 * r))
+    else:
+        found += pieces(
+            "cap", cylinder(r, d.real(0.1, 0.3), bevel=0.05).at(z=-0.1).turned(0, 90).at(y=0, z=high + 0.9 * r)
+        )
+    if d.chance(0.3):
+        found += pieces("base", cylinder(d.real(0.3, 0.7) * r, 0.12, top=0.8, bevel=0.02).at(z=-0.08))
     return found

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.geometry import Floats
-from pipeline.render.procedural.pieces import Dice, Piece, around, both, corners, in_row, pieces
+from pipeline.render.procedural.pieces import Dice, Piece, around, both, pieces
 from pipeline.solids import outlines
 from pipeline.solids.bodies import along, ball, block, cylinder, extrude, pipe, ring, tube
 from pipeline.solids.grids import spline
@@ -75,7 +75,7 @@ def bent(d: Dice) -> list[Piece]:
         bow = [(r * np.cos(a), 0, r * np.sin(a)) for a in np.linspace(np.pi * 0.95, -0.6, 16)]
         path = np.concatenate([bow, [(0.1, 0, -r * 1.1), (0, 0, -r * 1.5), (0, 0, -r * d.real(2, 4))]])
     else:
-        path = spline(np.cumsum(d.rng.uniform(-1, 1, (d.whole(3, 5), 3)) + (0.7, 0, 0), axis=0), 40)
+        path = spline(np.cumsum(d.rng.uniform((-0.3, -1, -1), (1.7, 1, 1), (d.whole(3, 5), 3)), axis=0), 40)
     found = pieces("body", along(path, _section(d, thick), up=(0, 1, 0)))
     if kind == "handle":
         foot = cylinder(2.2 * thick, 0.08, bevel=0.02).at(z=-0.03)
@@ -129,8 +129,8 @@ def loop(d: Dice) -> list[Piece]:
         path[:, 2] = d.real(0.1, 0.3) * np.cos(n * np.arctan2(path[:, 1], path[:, 0]))
     section = _section(d, thick)
     if kind == "frame" and d.chance(0.5):  # a picture frame's moulding
-        w, t = d.real(0.1, 0.3), d.real(0.06, 0.2)
-        section = np.array([(-w, -t), (w, -t), (w, 0.4 * t), (0.4 * w, t), (0, 0.5 * t), (-w, 0.7 * t)])
+        m, t = d.real(0.1, 0.3), d.real(0.06, 0.2)
+        section = np.array([(-m, -t), (m, -t), (m, 0.4 * t), (0.4 * m, t), (0, 0.5 * t), (-m, 0.7 * t)])
     found = pieces("body", along(path, section, closed=True, up=(0, 0, 1)))
     if kind == "frame" and d.chance(0.5) and len(shape) == 4:
         found += pieces("panel", block((2 * w_of(shape), 2 * h_of(shape), 0.5 * thick)).at(z=-0.3 * thick))
@@ -157,11 +157,11 @@ def piping(d: Dice) -> list[Piece]:
     ends: list[tuple[Floats, int, float]] = []  # where, axis, direction
     if kind in ("elbow", "run"):
         a, b = d.log(0.6, 1.8), d.log(0.6, 1.8)
-        points = [(-a, 0, 0), (0, 0, 0), (0, 0, b)]
+        points = [(-a, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, b)]
         if kind == "run":
             c = d.log(0.8, 1.8)
-            points += [(0, c, b)] if d.chance(0.5) else [(c, 0, b)]
-        path = _soft(np.array(points, dtype=float), 2 * r, 8)
+            points += [(0.0, c, b)] if d.chance(0.5) else [(c, 0.0, b)]
+        path = _soft(np.array(points), 2 * r, 8)
         found += pieces("body", tube(path, r, sides=24))
         ends = [(path[0], 0, -1.0), (path[-1], 2 if kind == "elbow" else (1 if points[-1][1] else 0), 1.0)]
     else:
@@ -188,8 +188,7 @@ def piping(d: Dice) -> list[Piece]:
         if flange == "none":
             continue
         if flange == "flange":
-            n = 6
-            holes = [outlines.turned(outlines.circle(0.13 * r, 8) + (1.5 * r, 0), 360 * k / n) for k in range(n)]
+            holes = outlines.around(outlines.circle(0.13 * r, 8), 1.5 * r, 6)
             mesh = extrude(outlines.circle(1.85 * r, 32), 0.35 * r, holes=[outlines.circle(0.8 * r, 24), *holes])
         elif flange == "nut":
             mesh = cylinder(1.5 * r, 0.8 * r, segments=6, bevel=0.08 * r)
@@ -288,6 +287,3 @@ def bars_star(d: Dice) -> list[Piece]:
                 "frame", cylinder(0.07, stand + 0.05), cylinder(d.real(0.5, 0.8), 0.1, bevel=0.03).at(z=-0.05)
             )
     return found
-
-
-__all__ = ["bars_star", "bent", "cage", "corners", "in_row", "loop", "piping", "spring"]
