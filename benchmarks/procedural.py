@@ -1,6 +1,6 @@
 """How varied the procedural objects are, and how much of a folder of real meshes they cover; what an object costs.
 
-    python -m benchmarks.procedural                                # 400 objects against ../shared/data/meshes_unlabelled
+    python -m benchmarks.procedural                # 400 objects and as many of ../shared/data/meshes_unlabelled
     python -m benchmarks.procedural --meshes FOLDER --count 100
 
 Prints JSON lines. Shapes are compared by three descriptors that need no training: "d2", the distribution of distances

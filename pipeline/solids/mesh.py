@@ -119,7 +119,7 @@ def _edges(mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 def shaded(mesh: Mesh, crease_deg: float = 38.0) -> tuple[Floats, NDArray[np.int64], Floats]:
     """Vertices, faces and unit normals of a mesh: smooth where it bends little, split along sharper edges.
 
-    Faces round a vertex share its normal (the mean by area) as far as they hang together through edges that bend by
+    Faces round a vertex share its normal (the mean by angle) as far as they hang together through edges that bend by
     less than `crease_deg`.
     """
     n_faces = len(mesh.faces)
@@ -140,7 +140,10 @@ def shaded(mesh: Mesh, crease_deg: float = 38.0) -> tuple[Floats, NDArray[np.int
     group, found = np.unique(_connected(3 * n_faces, *links), return_inverse=True)
     corner_of = found.reshape(-1).astype(np.int64)
     source = np.concatenate([mesh.faces[:, k] for k in range(3)])[group]
-    sums = np.stack([np.bincount(corner_of, np.tile(axis, 3), len(group)) for axis in areas.T], axis=1)
+    corners = mesh.vertices[mesh.faces.T]  # by angle: by area, a quad's diagonal would pull the normal to one side
+    to_next, to_last = np.roll(corners, -1, 0) - corners, np.roll(corners, 1, 0) - corners
+    angles = np.arctan2(np.linalg.norm(areas, axis=1), np.einsum("kij,kij->ki", to_next, to_last)).ravel()
+    sums = np.stack([np.bincount(corner_of, np.tile(axis, 3) * angles, len(group)) for axis in unit.T], axis=1)
     normals = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-300)
     return mesh.vertices[source], corner_of.reshape(3, -1).T, normals
 

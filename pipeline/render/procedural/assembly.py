@@ -24,7 +24,7 @@ def assembly(d: Dice) -> list[Piece]:
 def _core(d: Dice) -> Mesh:
     """A body about the z axis without an opening at its top or sides."""
     kind = d.pick(("block", "cylinder", "outline", "turned", "soft", "bar", "super"))
-    w, length, high = d.log(0.5, 1.4), d.log(0.5, 1.4), d.log(0.3, 2.0)
+    w, length, high = d.log(0.4, 1.8), d.log(0.4, 1.8), d.log(0.15, 2.4)
     if kind == "block":
         return block((w, length, high), bevel=d.pick((0.0, 0.05)))
     if kind == "cylinder":

@@ -13,7 +13,7 @@ from pipeline.solids.mesh import Mesh
 
 def column(d: Dice) -> list[Piece]:
     """Plinth, base, plain or fluted shaft, capital, abacus; posts and balusters."""
-    high, r = d.log(1.0, 6.0), 0.5
+    high, r = d.log(0.7, 8.0), 0.5
     t = d.real(0.12, 0.3)
     square = d.chance(0.3)
     found = pieces("base", block((1.5, 1.5, t), bevel=0.03))
@@ -43,7 +43,7 @@ def column(d: Dice) -> list[Piece]:
 def arch(d: Dice) -> list[Piece]:
     """Arches, gates, door and window frames with panels, tunnels."""
     w, up, t = d.real(0.4, 0.8), d.log(0.3, 1.6), d.real(0.12, 0.3)
-    deep = d.log(0.15, 1.5)
+    deep = d.log(0.06, 1.5)
     steps = d.pick((3, 20, 20))
     inner = [(w * np.cos(a), up + w * np.sin(a) * d.pick((1.0,))) for a in np.linspace(0, np.pi, steps + 1)]
     out = w + t
@@ -165,7 +165,7 @@ def house(d: Dice) -> list[Piece]:
 
 def fence(d: Dice) -> list[Piece]:
     """Fences, balustrades, barriers: posts, pickets, rails."""
-    n, long, high = d.whole(3, 11), d.real(1.5, 3.0), d.real(0.5, 1.3)
+    n, long, high = d.whole(3, 11), d.real(1.0, 3.0), d.real(0.4, 1.6)
     pitch = long / n
     kind = d.pick(("picket", "baluster", "round", "board"))
     if kind == "picket":

@@ -23,7 +23,7 @@ from pipeline.solids.mesh import Mesh
 
 def device(d: Dice) -> list[Piece]:
     """A case with a screen, keys, dials, feet, an antenna: phones, radios, consoles, speakers, cameras."""
-    w, length, t = d.log(0.8, 2.4), d.log(0.7, 1.8), d.log(0.08, 1.0)
+    w, length, t = d.log(0.6, 2.6), d.log(0.7, 1.8), d.log(0.05, 1.0)
     case = d.pick(
         (
             block((w, length, t), bevel=0.12 * min(t, 0.5)),

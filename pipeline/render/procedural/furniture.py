@@ -129,7 +129,7 @@ def seat(d: Dice) -> list[Piece]:
 
 def shelf(d: Dice) -> list[Piece]:
     """Shelves, book cases, cabinets, chests of drawers, lockers: boards in a grid, with fronts, knobs, plinth, feet."""
-    w, deep, high = d.log(0.7, 2.5), d.real(0.4, 1.0), d.log(0.6, 2.8)
+    w, deep, high = d.log(0.6, 2.8), d.log(0.2, 1.0), d.log(0.5, 3.2)
     t = d.real(0.04, 0.1)
     rows, columns = d.whole(1, 5), d.whole(1, 3)
     open_front = d.chance(0.5)
@@ -179,7 +179,7 @@ def shelf(d: Dice) -> list[Piece]:
 
 def crate(d: Dice) -> list[Piece]:
     """Boxes, crates of slats, pallets, trays, bins, boxes with lids and bands."""
-    w, length, high = d.log(0.8, 2.0), d.log(0.8, 1.6), d.log(0.3, 1.6)
+    w, length, high = d.log(0.6, 2.4), d.log(0.5, 1.6), d.log(0.15, 1.6)
     t = d.real(0.04, 0.1)
     kind = d.pick(("slats", "pallet", "tray", "box", "bin"))
     if kind == "slats":
@@ -258,7 +258,7 @@ def lamp(d: Dice) -> list[Piece]:
             stem = turned_body(profiles.closed_profile(profiles.turned_side(d, high, d.real(0.1, 0.3))), 28)
         else:
             stem = cylinder(0.05, high, segments=16)
-        found += pieces("stem", stem.at(z=0.02), cylinder(0.05, 0.7 * tall, segments=16).at(z=high))
+        found += pieces("stem", stem.at(z=0.02), cylinder(0.05, 0.55 * tall + 0.12, segments=16).at(z=high))
         z = high + 0.55 * tall - tall + 0.1
         found += pieces("shade", shade.at(z=z), hoop.at(z=z))
         return found + pieces("bulb", ball((0.12, 0.12, 0.16)).at(z=high + 0.05))

@@ -14,13 +14,13 @@ from pipeline.solids.mesh import Mesh, merged
 
 def plate(d: Dice) -> list[Piece]:
     """A thin to stout plate of any outline, with holes and broken edges."""
-    thick = d.log(0.08, 0.9)
+    thick = d.log(0.03, 0.9)
     if d.chance(0.65):
         shape = profiles.compact_outline(d)
         holes = profiles.hole_pattern(d, shape, 0.1)
     else:
         shape, holes = profiles.outline(d), []
-    bevel = d.pick((0.0, d.real(0.01, 0.04)))
+    bevel = d.pick((0.0, min(d.real(0.01, 0.04), 0.3 * thick)))
     return pieces("body", extrude(shape, thick, holes=holes, bevel=bevel, bevel_steps=d.pick((1, 3))))
 
 
@@ -30,7 +30,7 @@ def bar(d: Dice) -> list[Piece]:
     if shape is None:
         kind = d.pick(("L", "U", "T", "I", "Z", "H", "+"))
         shape = outlines.profile(kind, d.real(0.5, 1.0), d.real(0.5, 1.0), d.real(0.08, 0.2))
-    long = d.log(1.5, 6.0)
+    long = d.log(1.5, 14.0)
     if d.chance(0.25):
         angle = np.radians(np.linspace(0, d.real(40, 170), 20))
         r = long / angle[-1]
@@ -55,7 +55,7 @@ def prism(d: Dice) -> list[Piece]:
     shape = profiles.compact_outline(d) if d.chance(0.6) else profiles.outline(d)
     if len(shape) > 70:
         shape = outlines.superellipse(2, 2, 5)
-    high = d.log(0.8, 4.0)
+    high = d.log(0.6, 7.0)
     twist = d.pick((0.0, d.real(20, 360)))
     top = d.pick((1.0, d.real(0.2, 0.95), d.real(1.05, 1.5)))
     levels = max(1, round(abs(twist) / 14))
@@ -70,7 +70,7 @@ def prism(d: Dice) -> list[Piece]:
 
 def gear_shaft(d: Dice) -> list[Piece]:
     """A stepped shaft with gears, pulleys, discs and collars on it."""
-    thin, long = d.real(0.1, 0.25), d.log(1.2, 4.0)
+    thin, long = d.real(0.1, 0.25), d.log(1.0, 7.0)
     found = pieces("shaft", cylinder(thin, long, bevel=0.02, segments=24))
     z = 0.1 * long
     while z < 0.85 * long and len(found) < 6:
@@ -107,7 +107,7 @@ def gear_shaft(d: Dice) -> list[Piece]:
 def bracket(d: Dice) -> list[Piece]:
     """An angle of sheet metal: two plates with holes, ribs in the corner, bolts in some of the holes."""
     wide, deep, high = d.real(0.8, 2.2), d.real(0.7, 1.6), d.real(0.7, 2.0)
-    thick = d.real(0.06, 0.18)
+    thick = d.log(0.03, 0.18)
     n = d.whole(1, 3)
     hole = outlines.circle(0.16 * min(wide / n, deep, high), 16)
     places = [(wide * (k + 0.5) / n - 0.5 * wide, 0.12 * deep) for k in range(n)]
@@ -145,7 +145,7 @@ def bolt(d: Dice, radius: float, long: float) -> Mesh:
 
 def fastener(d: Dice) -> list[Piece]:
     """Bolts, screws and rivets with ridges for a thread; nuts and washers on some."""
-    r, long = d.real(0.15, 0.3), d.log(0.6, 2.6)
+    r, long = d.real(0.12, 0.3), d.log(0.4, 3.5)
     turns = int(min(long * d.real(0.4, 0.9) / (0.3 * r), 24))
     pitch = 0.32 * r
     side = [(0.9 * r, 0.0)]

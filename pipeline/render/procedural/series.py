@@ -28,8 +28,8 @@ KINDS: dict[str, tuple[Kind, float]] = {
     "vessel": (turned.vessel, 2),
     "knob": (turned.knob, 0.7),
     "stack": (turned.stack, 1),
-    "plate": (plates.plate, 1.8),
-    "bar": (plates.bar, 1),
+    "plate": (plates.plate, 2.4),
+    "bar": (plates.bar, 1.4),
     "prism": (plates.prism, 1.2),
     "gear shaft": (plates.gear_shaft, 1),
     "bracket": (plates.bracket, 1),
@@ -51,7 +51,7 @@ KINDS: dict[str, tuple[Kind, float]] = {
     "crate": (furniture.crate, 1),
     "bed": (furniture.bed, 0.4),
     "lamp": (furniture.lamp, 0.8),
-    "hand tool": (tools.hand_tool, 1.5),
+    "hand tool": (tools.hand_tool, 2),
     "flat tool": (tools.spanner, 1),
     "weights": (tools.weights, 0.6),
     "device": (devices.device, 1.2),
@@ -96,8 +96,8 @@ def _model(d: Dice, found: list[Piece]) -> Model | None:
     if count > FACES[1]:
         return None
     meshes = [piece.mesh for piece in found]
-    if d.chance(0.3):  # proportions no recipe thought of
-        stretch = np.exp(d.rng.normal(0, 0.2, 3))
+    if d.chance(0.4):  # proportions no recipe thought of
+        stretch = np.exp(d.rng.normal(0, 0.3, 3))
         meshes = [mesh.scaled(stretch) for mesh in meshes]
     meshes = [outward(mesh) for mesh in meshes]
     while count < FACES[0]:

@@ -12,7 +12,7 @@ from pipeline.solids.mesh import Mesh, outward, welded
 
 
 def _radii(d: Dice) -> tuple[float, float, float]:
-    return d.log(0.35, 1.0), d.log(0.35, 1.0), d.log(0.25, 1.0)
+    return d.log(0.3, 1.0), d.log(0.3, 1.0), d.log(0.2, 1.0)
 
 
 def _power(d: Dice) -> float:

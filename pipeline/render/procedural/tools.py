@@ -44,7 +44,7 @@ def _grip(d: Dice, long: float, thick: float) -> Mesh:
 
 def hand_tool(d: Dice) -> list[Piece]:
     """A handle with a head: hammers, mallets, axes, drivers, chisels, shovels, brushes, rollers, rakes, spoons."""
-    long, thick = d.log(0.8, 3.0), d.log(0.1, 0.26)
+    long, thick = d.log(0.8, 4.5), d.log(0.08, 0.26)
     found = pieces("handle", _grip(d, long, thick))
     z = long - 0.02
     head = d.pick(
@@ -145,7 +145,7 @@ def hand_tool(d: Dice) -> list[Piece]:
 def spanner(d: Dice) -> list[Piece]:
     """Flat tools cut from plate: spanners, keys, combs, rulers, bottle openers, saw blades, hinges."""
     kind = d.pick(("spanner", "ring", "key", "comb", "saw", "hinge"))
-    t = d.real(0.06, 0.2)
+    t = d.log(0.025, 0.2)
     if kind in ("spanner", "ring"):
         long, w, r = d.real(1.5, 3.0), d.real(0.12, 0.25), d.real(0.35, 0.55)
         found = pieces(
@@ -206,7 +206,7 @@ def spanner(d: Dice) -> list[Piece]:
 
 def weights(d: Dice) -> list[Piece]:
     """Bars with ends: dumb-bells, rolling pins, reels, bones, axles, barbells, mirrored about their middle."""
-    long, thin = d.log(0.5, 2.5), d.real(0.08, 0.22)
+    long, thin = d.log(0.5, 4.0), d.real(0.08, 0.22)
     found = pieces("bar", cylinder(thin, 2 * long, segments=24).at(z=-long).turned(1, 90))
     x = long * d.real(0.5, 0.95)
     for _ in range(d.whole(1, 3)):

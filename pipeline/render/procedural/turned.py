@@ -15,7 +15,7 @@ from pipeline.solids.mesh import Mesh
 
 def spindle(d: Dice) -> list[Piece]:
     """A solid turned part, round or with a few flat sides, sometimes with a bore."""
-    height = d.log(0.3, 5.0)
+    height = d.log(0.08, 12.0)
     side = profiles.turned_side(d, height, 1.0)
     segments = d.pick((32, 40, 40, 40, d.whole(3, 8), d.whole(10, 16)))
     if d.chance(0.35):
@@ -44,7 +44,7 @@ def fluted(d: Dice) -> list[Piece]:
 
 def wheel(d: Dice) -> list[Piece]:
     """Rim, hub and spokes or a disc; tyre treads and bolts on some."""
-    wide, hub, inner = d.log(0.12, 0.7), d.real(0.12, 0.3), d.real(0.6, 0.85)
+    wide, hub, inner = d.log(0.06, 0.8), d.real(0.12, 0.3), d.real(0.6, 0.85)
     rim = turned_body(
         outlines_closed(outlines.rounded(_ring_section(d, inner, 1.0, wide), d.real(0.0, 0.3) * wide, 3)), 44
     )
@@ -136,7 +136,7 @@ def _vessel_side(d: Dice, height: float) -> Floats:
 
 def vessel(d: Dice) -> list[Piece]:
     """Bowls, cups, vases, bottles, pots: with feet, handles, spouts, lids and bands."""
-    height = d.log(0.4, 3.5)
+    height = d.log(0.2, 5.0)
     side = _vessel_side(d, height)
     wall = d.real(0.05, 0.14)
     segments = d.pick((40, 40, 40, 6, 8, 4))

@@ -45,7 +45,7 @@ def spring(d: Dice) -> list[Piece]:
 
 def bent(d: Dice) -> list[Piece]:
     """A bar bent as hooks, handles, clamps, U bolts, S hooks, cranks, paper clips, walking sticks are."""
-    thick = d.real(0.06, 0.16)
+    thick = d.log(0.025, 0.17)
     kind = d.pick(("hook", "s", "u", "crank", "free", "handle", "question"))
     arc = np.linspace(0, np.pi, 14)
     if kind == "hook":
@@ -104,7 +104,7 @@ def _soft(path: Floats, radius: float, steps: int = 5) -> Floats:
 def loop(d: Dice) -> list[Piece]:
     """Closed bars: rings, frames, links, buckles, chains of links, knots."""
     kind = d.pick(("ring", "frame", "frame", "chain", "knot", "wavy"))
-    thick = d.real(0.06, 0.25)
+    thick = d.log(0.025, 0.28)
     if kind == "chain":
         n, thin = d.whole(2, 6), d.real(0.12, 0.2)
         shape = np.concatenate([outlines.slot(2, 1.2, 9), np.zeros((20, 1))], axis=1)
@@ -129,8 +129,8 @@ def loop(d: Dice) -> list[Piece]:
         path[:, 2] = d.real(0.1, 0.3) * np.cos(n * np.arctan2(path[:, 1], path[:, 0]))
     section = _section(d, thick)
     if kind == "frame" and d.chance(0.5):  # a picture frame's moulding
-        m, t = d.real(0.1, 0.3), d.real(0.06, 0.2)
-        section = np.array([(-m, -t), (m, -t), (m, 0.4 * t), (0.4 * m, t), (0, 0.5 * t), (-m, 0.7 * t)])
+        m, up = d.real(0.1, 0.3), d.real(0.06, 0.2)
+        section = np.array([(-m, -up), (m, -up), (m, 0.4 * up), (0.4 * m, up), (0, 0.5 * up), (-m, 0.7 * up)])
     found = pieces("body", along(path, section, closed=True, up=(0, 0, 1)))
     if kind == "frame" and d.chance(0.5) and len(shape) == 4:
         found += pieces("panel", block((2 * w_of(shape), 2 * h_of(shape), 0.5 * thick)).at(z=-0.3 * thick))
