@@ -71,11 +71,15 @@ def _tube(rings: Floats, ahead: NDArray[np.int64], cap: NDArray[np.int64] | None
     n_rings, count = rings.shape[:2]
     low = np.arange(n_rings if cap is None else n_rings - 1)[:, None] * count
     high = (low + count) % (n_rings * count)
-    i, j = np.arange(count), ahead
-    faces = [np.stack([low + i, low + j, high + j], -1), np.stack([low + i, high + j, high + i], -1)]
-    walls = [face.reshape(-1, 3) for face in faces]
+    vertices = rings.reshape(-1, 3)
+    a, b, c, d = (
+        index.ravel() for index in (low + np.arange(count), low + ahead, high + ahead, high + np.arange(count))
+    )
+    ac, bd = (np.linalg.norm(vertices[p] - vertices[q], axis=1) for p, q in ((a, c), (b, d)))
+    other = bd < (1 - 1e-6) * ac  # cut along the shorter diagonal: sheared walls would be ragged
+    walls = [np.stack([a, b, np.where(other, d, c)], axis=1), np.stack([np.where(other, b, a), c, d], axis=1)]
     ends = [] if cap is None else [cap[:, ::-1], cap + (n_rings - 1) * count]
-    return Mesh(rings.reshape(-1, 3), np.concatenate([*walls, *ends]))
+    return Mesh(vertices, np.concatenate([*walls, *ends]))
 
 
 def along(

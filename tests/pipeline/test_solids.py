@@ -121,6 +121,13 @@ def test_a_bevel_takes_the_edges_and_leaves_the_ends() -> None:
     assert np.ptp(mesh.vertices[mesh.vertices[:, 2] == 0], axis=0)[:2] == pytest.approx([1.8, 1.8])
 
 
+@pytest.mark.parametrize("twist", [-110, 110])
+def test_twisted_walls_are_not_ragged(twist: float) -> None:
+    mesh = bodies.extrude(outlines.circle(1, 40), 0.8, levels=6, twist_deg=twist)
+    vertices, _, _ = shaded(mesh, 25)
+    assert len(vertices) == (7 + 2) * 40  # smooth everywhere but round the ends
+
+
 def test_an_inset_that_would_turn_sides_round_is_made_smaller() -> None:
     outline = outlines.rounded(outlines.rectangle(1, 1), 0.05, 4)
     moved = outlines.inset(outline, 0.2)

@@ -56,7 +56,7 @@ def prism(d: Dice) -> list[Piece]:
     if len(shape) > 70:
         shape = outlines.superellipse(2, 2, 5)
     high = d.log(0.6, 7.0)
-    twist = d.pick((0.0, d.real(20, 360)))
+    twist = d.pick((0.0, d.real(20, min(360, 130 * high))))
     top = d.pick((1.0, d.real(0.2, 0.95), d.real(1.05, 1.5)))
     levels = max(1, round(abs(twist) / 14))
     body = extrude(shape, high, top=top, twist_deg=twist, levels=levels, bevel=0.0 if twist else d.pick((0.0, 0.04)))

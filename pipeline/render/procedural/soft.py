@@ -51,15 +51,15 @@ def hull(d: Dice) -> list[Piece]:
     """A body lofted through rounded sections: boats, shoes, mice, bottles on their side, fuselages."""
     n = d.whole(4, 6)
     x = np.linspace(-1, 1, n)
-    wide = np.array([d.real(0.15, 0.6) for _ in x])
-    high = np.array([d.real(0.12, 0.45) for _ in x])
+    wide = d.real(0.2, 0.6) * np.array([d.real(0.65, 1.15) for _ in x])
+    high = d.real(0.12, 0.45) * np.array([d.real(0.65, 1.2) for _ in x])
     if d.chance(0.6):
         wide[-1] *= 0.25
         high[-1] *= 0.3
     if d.chance(0.4):
         wide[0] *= 0.35
         high[0] *= 0.4
-    middle = high if d.chance(0.6) else np.array([d.real(-0.1, 0.15) for _ in x])
+    middle = high if d.chance(0.6) else np.array([d.real(-0.05, 0.08) for _ in x])
     stations = spline(np.stack([x, 0 * x, wide, middle, high], axis=1), 26)
     stations[:, [2, 4]] = np.maximum(stations[:, [2, 4]], 0.03)
     body = outward(welded(grids.loft(stations, power=d.real(2, 5), sides=36)))

@@ -15,7 +15,7 @@ from pipeline.solids.mesh import Mesh
 
 def spindle(d: Dice) -> list[Piece]:
     """A solid turned part, round or with a few flat sides, sometimes with a bore."""
-    height = d.log(0.08, 12.0)
+    height = d.log(0.25, 10.0)
     side = profiles.turned_side(d, height, 1.0)
     segments = d.pick((32, 40, 40, 40, d.whole(3, 8), d.whole(10, 16)))
     if d.chance(0.35):
@@ -136,7 +136,7 @@ def _vessel_side(d: Dice, height: float) -> Floats:
 
 def vessel(d: Dice) -> list[Piece]:
     """Bowls, cups, vases, bottles, pots: with feet, handles, spouts, lids and bands."""
-    height = d.log(0.2, 5.0)
+    height = d.log(0.3, 4.5)
     side = _vessel_side(d, height)
     wall = d.real(0.05, 0.14)
     segments = d.pick((40, 40, 40, 6, 8, 4))
@@ -159,7 +159,7 @@ def vessel(d: Dice) -> list[Piece]:
         body = turned_body(profiles.cup_profile(side, wall, 1.5 * wall), segments)
     found += pieces("body", body.at(z=stand))
     top = stand + height
-    if segments == 40 and d.chance(0.45):
+    if segments == 40 and height > 0.6 and d.chance(0.6):
         found += pieces("handle", *_handles(d, radius_at, height, stand))
     if d.chance(0.35) or closed:
         found += [Piece(mesh.at(z=top), "lid") for mesh in _lid(d, lip)]
