@@ -91,7 +91,8 @@ def seat(d: Dice) -> list[Piece]:
         return found + pieces("legs", *corners(foot))
     thick, leg, up = d.real(0.05, 0.14), d.real(0.04, 0.08), d.real(0.5, 1.3)
     kind = d.pick(("panel", "slats", "bars", "bow"))
-    top = soft_box((w, length, thick), 0.35) if kind == "bow" else _top(d, w, length, thick)
+    # a back stands on the seat's corners, so the seat has them
+    top = d.pick((soft_box((w, length, thick), 0.35), block((w, length, thick), bevel=0.2 * thick)))
     found = pieces("seat", top.at(z=high))
     x, y = 0.5 * w - 1.2 * leg, 0.5 * length - 1.2 * leg
     one = _leg(d, high + 0.02, leg)

@@ -53,12 +53,12 @@ def bar(d: Dice) -> list[Piece]:
 def prism(d: Dice) -> list[Piece]:
     """A tall, tapered or twisted prism: drills, columns, twisted vases, obelisks."""
     shape = profiles.compact_outline(d) if d.chance(0.6) else profiles.outline(d)
-    if len(shape) > 70:
+    if len(shape) > 60:  # twisted, it would have too many faces
         shape = outlines.superellipse(2, 2, 5)
     high = d.log(0.6, 7.0)
     twist = d.pick((0.0, d.real(20, min(360, 130 * high))))
     top = d.pick((1.0, d.real(0.2, 0.95), d.real(1.05, 1.5)))
-    levels = max(1, round(abs(twist) / 14))
+    levels = max(1, round(abs(twist) / 9))
     body = extrude(shape, high, top=top, twist_deg=twist, levels=levels, bevel=0.0 if twist else d.pick((0.0, 0.04)))
     found = pieces("body", body)
     if d.chance(0.3):
