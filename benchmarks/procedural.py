@@ -40,6 +40,9 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=400)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
+    paths = sorted(args.meshes.glob("*.glb"))
+    if len(paths) < 2:
+        parser.error(f"{args.meshes}: no GLB files to compare with; --meshes names another folder")
 
     procedural_object(0, args.seed)  # imports are not counted
     times, meshes = [], []
@@ -59,7 +62,6 @@ def main() -> None:
         )
     )
 
-    paths = sorted(args.meshes.glob("*.glb"))
     chosen = seeds.generator("benchmark", args.seed).permutation(len(paths))[: args.count]
     real = [mesh for mesh in (read(paths[i]) for i in chosen) if mesh is not None]
     compare([describe(mesh, k) for k, mesh in enumerate(real)], [describe(mesh, k) for k, mesh in enumerate(meshes)])
