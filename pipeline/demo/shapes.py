@@ -8,28 +8,26 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
 from dope.common import seeds
 from dope.common.errors import UsageError
-from pipeline.demo.solids import (
-    Part,
-    box,
-    cylinder,
-    ellipsoid,
-    joined,
-    lathe,
-    loft,
-    placed,
-    spline,
-    sweep,
-    turn_about,
-)
 from pipeline.geometry import Floats
+from pipeline.solids.grids import box, cylinder, ellipsoid, joined, lathe, loft, placed, spline, sweep, turn_about
 
 DIAMETER = 1.2
 """Diameter of the sphere about the bounding box's centre that every object just fits into."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A named part of an object, such as the lid: grids (m, n, 3) whose union with the other parts' is closed."""
+
+    name: str
+    grids: tuple[Floats, ...]
+
 
 Recipe = Callable[[np.random.Generator], list[Part]]
 

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from pipeline.demo.light import Light
 from pipeline.demo.raster import Panel
-from pipeline.demo.solids import box, cylinder, ellipsoid, placed, turn_about
 from pipeline.demo.textures import painted_plane
 from pipeline.geometry import Floats
+from pipeline.solids.grids import box, cylinder, ellipsoid, placed, turn_about
 
 ROOM_RADIUS, ROOM_WALLS = 5.6, 6
 NEAR_RING, FAR_RING = (0.95, 1.5), (3.7, 4.9)

@@ -15,8 +15,8 @@ from dope.common.errors import UsageError
 from pipeline.demo import film, matroska, scene, shapes, surroundings, textures
 from pipeline.demo.film import DemoConfig, FilmConfig, film_objects, look_at
 from pipeline.demo.raster import NEAR, Panel, project, rasterise
-from pipeline.demo.solids import box, cylinder, ellipsoid, loft, sweep
 from pipeline.geometry import Camera, rotation_angle_deg
+from pipeline.solids.grids import box, cylinder, ellipsoid, loft, sweep
 
 SMALL = FilmConfig(width=96, height=72, frames=4, samples=1, detail=0.25)
 

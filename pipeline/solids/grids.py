@@ -7,20 +7,11 @@ grid row given twice in the same place makes a sharp edge: the normals of the tw
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from pipeline.geometry import Floats
-
-
-@dataclass(frozen=True)
-class Part:
-    """A named part of an object, such as the lid: grids (m, n, 3) whose union with the other parts' is closed."""
-
-    name: str
-    grids: tuple[Floats, ...]
 
 
 def spline(points: ArrayLike, count: int) -> Floats:
