@@ -39,6 +39,10 @@ class Geometry:
     low: NDArray[np.float64]
     high: NDArray[np.float64]
 
+    def corners(self) -> NDArray[np.float64]:
+        """(8, 3) of the bounding box."""
+        return np.array(np.meshgrid(*zip(self.low, self.high, strict=True))).reshape(3, -1).T
+
 
 def geometry_of(model: Model) -> Geometry:
     """Raises BadInput for a model without faces, with a face that names no vertex, or with numbers that are not."""

@@ -152,12 +152,15 @@ def _samples(keys: Floats, radii: Floats, toward: Floats, power: Floats) -> tupl
     return np.concatenate([*discs, sphere]), np.concatenate([shares, weights])
 
 
-def frame_of(direction: Floats) -> tuple[Floats, Floats]:
-    """Two unit vectors (3,) that stand upright on a unit vector and on each other."""
-    helper = np.array([1.0, 0, 0]) if abs(direction[2]) > 0.9 else np.array([0, 0, 1.0])
-    across = np.cross(helper, direction)
-    across /= np.linalg.norm(across)
-    return across, np.cross(direction, across)
+def frame_of(directions: Floats) -> tuple[Floats, Floats]:
+    """Two unit vectors (..., 3) that stand upright on unit vectors (..., 3) and on each other."""
+    x, y, z = np.moveaxis(directions, -1, 0)
+    steep = np.abs(z) > 0.9
+    zero = np.zeros_like(z)
+    across = np.stack([np.where(steep, zero, -y), np.where(steep, -z, x), np.where(steep, y, zero)], axis=-1)
+    across /= np.linalg.norm(across, axis=-1, keepdims=True)
+    a, b, c = np.moveaxis(across, -1, 0)
+    return across, np.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=-1)
 
 
 def _white(harmonics: Floats, keys: Floats, key_directions: Floats) -> float:

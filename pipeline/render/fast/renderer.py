@@ -17,21 +17,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dope.common.errors import BadInput
 from pipeline.geometry import Camera, Floats
 from pipeline.render.config import FastConfig
-from pipeline.render.fast.context import context, program
+from pipeline.render.fast.context import context
 from pipeline.render.fast.geometry import Geometry, geometry_of
+from pipeline.render.fast.targets import Targets
 from pipeline.render.fast.upload import SceneOnDevice
 from pipeline.render.scene import Picture, Scene, Shot
-
-if TYPE_CHECKING:
-    import moderngl
 
 NEAREST = 1e-3
 """Nothing nearer to the camera is seen."""
@@ -50,7 +46,7 @@ class FastRenderer:
 
     def __init__(self, config: FastConfig | None = None) -> None:
         self.config = config or FastConfig()
-        self._targets: dict[tuple[int, int], _Targets] = {}
+        self._targets: dict[tuple[int, int], Targets] = {}
         context()
 
     def render(self, scene: Scene) -> Iterator[Picture]:
@@ -78,22 +74,9 @@ class FastRenderer:
         targets = self._targets.get((camera.width, camera.height))
         if targets is None:
             self.close()  # sizes seldom change
-            targets = self._targets[camera.width, camera.height] = _Targets(camera.width, camera.height, scale)
-        matrix = clip_from_world(camera, geometry)
-        targets.centre.see(matrix, device.visible)
-        if targets.samples is not targets.centre:
-            targets.samples.see(matrix, device.visible)
-        shade = program("shade")
-        pixels = np.linalg.inv(camera.R) @ np.linalg.inv(camera.K)
-        shade["world_from_pixel"].write(pixels.T.astype(np.float32).tobytes())
-        shade["eye"].write(camera.centre.astype(np.float32).tobytes())
-        shade["place"].value = tuple(map(float, shot.place))
-        shade["supersample"].value = scale
-        targets.samples.faces.use(0)
-        targets.centre.faces.use(1)
-        targets.picture.use()
-        device.use()
-        return targets.read()
+            targets = self._targets[camera.width, camera.height] = Targets(camera.width, camera.height, scale)
+        device.make_current()
+        return targets.shoot(shot, device, clip_from_world(camera, geometry))
 
 
 def clip_from_world(camera: Camera, geometry: Geometry) -> Floats:
@@ -101,8 +84,7 @@ def clip_from_world(camera: Camera, geometry: Geometry) -> Floats:
 
     Planes near and far are as tight as the model's box lets them be: depth is sharpest so.
     """
-    corners = np.array(np.meshgrid(*zip(geometry.low, geometry.high, strict=True))).reshape(3, -1).T
-    depths = corners @ camera.R[2] + camera.t[2]
+    depths = geometry.corners() @ camera.R[2] + camera.t[2]
     near = max(0.98 * float(depths.min()), NEAREST)
     far = max(1.02 * float(depths.max()), 2 * near)
     P = np.zeros((4, 4))
@@ -113,56 +95,3 @@ def clip_from_world(camera: Camera, geometry: Geometry) -> Floats:
     world = np.eye(4)
     world[:3, :3], world[:3, 3] = camera.R, camera.t
     return P @ world
-
-
-class _Seen:
-    """A target that holds numbers of faces."""
-
-    def __init__(self, width: int, height: int) -> None:
-        import moderngl
-
-        self.faces = context().texture((width, height), 1, dtype="f4")
-        self.faces.filter = (moderngl.NEAREST, moderngl.NEAREST)
-        self.depth = context().depth_renderbuffer((width, height))
-        self.target = context().framebuffer([self.faces], self.depth)
-
-    def see(self, matrix: Floats, visible: moderngl.VertexArray) -> None:
-        import moderngl
-
-        self.target.use()
-        self.target.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
-        context().enable_only(moderngl.DEPTH_TEST)
-        context().depth_func = "<"
-        program("visible")["clip_from_world"].write(matrix.T.astype(np.float32).tobytes())
-        visible.render(moderngl.TRIANGLES)
-
-    def release(self) -> None:
-        for part in (self.target, self.depth, self.faces):
-            part.release()
-
-
-class _Targets:
-    """What a shot is drawn into, for images of one size."""
-
-    def __init__(self, width: int, height: int, supersample: int) -> None:
-        self.size = (width, height)
-        self.centre = _Seen(width, height)
-        self.samples = self.centre if supersample == 1 else _Seen(width * supersample, height * supersample)
-        self.colour = context().texture((width, height), 4)
-        self.depth = context().texture((width, height), 1, dtype="f4")
-        self.picture = context().framebuffer([self.colour, self.depth])
-
-    def read(self) -> Picture:
-        width, height = self.size
-        rgba = np.frombuffer(self.picture.read(components=4), np.uint8).reshape(height, width, 4)
-        data = self.picture.read(components=1, attachment=1, dtype="f4")
-        depth: NDArray[Any] = np.frombuffer(data, np.float32).reshape(height, width).copy()
-        return Picture(np.ascontiguousarray(rgba[..., :3]), rgba[..., 3] > 127, depth)
-
-    def release(self) -> None:
-        self.picture.release()
-        self.colour.release()
-        self.depth.release()
-        self.centre.release()
-        if self.samples is not self.centre:
-            self.samples.release()
