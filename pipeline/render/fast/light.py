@@ -1,0 +1,170 @@
+"""A panorama as lights: one or two key lights that cast shadows, and the rest as smooth light from all around.
+
+The rest is kept as spherical harmonics of order 2 (Ramamoorthi and Hanrahan, SIGGRAPH 2001). Shadows are those of a
+fixed set of directions: some spread over the discs of the key lights, some over the whole sphere. A scene's light and
+object stand still, so a shadow map of each direction is made once and serves all its shots.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry import Floats
+from pipeline.render.fast.geometry import linear
+from pipeline.render.scene import Ground, Light
+
+ROWS = 64
+"""Rows of the panorama that lights are looked for in."""
+KEYS = 2
+"""Key lights at most."""
+KEY_SAMPLES = 10
+"""Directions over the disc of a key light."""
+AMBIENT_SAMPLES = 24
+"""Directions over the sphere for the rest."""
+DIRECTIONS = KEYS * KEY_SAMPLES + AMBIENT_SAMPLES
+KEY_RADIUS_DEG = (1.5, 16.0)
+"""Smallest and largest radius of a key light: the sun's own is less than a shadow map resolves."""
+KEY_REACH_DEG = 24.0
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+GREY_CARD = 0.62
+"""Radiance that a white surface gets at strength 0.65, before tone mapping."""
+USUAL_STRENGTH = 0.65
+
+
+@dataclass(frozen=True)
+class Lights:
+    """Light as the shaders take it. World coordinates; radiance in units of the panorama's mean.
+
+    Attributes:
+        harmonics: (9, 3) irradiance over pi of the smooth light, as factors of the polynomials of `basis`.
+        keys: (KEYS, 3) irradiance over pi of a surface that faces the key light; 0 for one that is not there.
+        key_directions: (KEYS, 3) unit, towards the light.
+        directions: (DIRECTIONS, 3) unit: KEY_SAMPLES for each key light, then AMBIENT_SAMPLES.
+        weights: (DIRECTIONS,) share of its key light, or power of the smooth light around it; 0: unused.
+        bounce: (3,) radiance of the lit ground, 0 without one.
+        exposure: multiplies radiance before tone mapping.
+    """
+
+    harmonics: Floats
+    keys: Floats
+    key_directions: Floats
+    directions: Floats
+    weights: Floats
+    bounce: Floats
+    exposure: float
+
+
+def basis(directions: Floats) -> Floats:
+    """Polynomials (..., 9) of unit vectors (..., 3), to which spherical harmonics up to order 2 are proportional."""
+    x, y, z = np.moveaxis(directions, -1, 0)
+    return np.stack([np.ones_like(x), y, z, x, x * y, y * z, 3 * z * z - 1, x * z, x * x - y * y], axis=-1)
+
+
+_NORM = np.array([0.282095, *[0.488603] * 3, 1.092548, 1.092548, 0.315392, 1.092548, 0.546274])
+_COSINE = np.array([np.pi, *[2 * np.pi / 3] * 3, *[np.pi / 4] * 5])
+
+
+def directions_of(rows: int, turn: float) -> tuple[Floats, Floats]:
+    """Directions (rows, 2 rows, 3) and solid angles (rows, 1) of the pixels of a panorama."""
+    elevation = np.pi / 2 - (np.arange(rows) + 0.5) * np.pi / rows
+    azimuth = (0.5 - (np.arange(2 * rows) + 0.5) / (2 * rows)) * 2 * np.pi + turn
+    flat = np.cos(elevation)[:, None]
+    shape = (rows, 2 * rows)
+    xyz = [flat * np.cos(azimuth), flat * np.sin(azimuth), np.broadcast_to(np.sin(elevation)[:, None], shape)]
+    return np.stack(xyz, axis=-1), flat * (np.pi / rows) ** 2
+
+
+def lights_of(light: Light, ground: Ground | None) -> Lights:
+    """The lights of a panorama over a ground, which hides the panorama's lower half and throws light back."""
+    radiance = cv2.resize(light.panorama, (2 * ROWS, ROWS), interpolation=cv2.INTER_AREA).astype(np.float64)
+    toward, angle = directions_of(ROWS, light.turn)
+    if ground is not None:
+        radiance[toward[..., 2] <= 0] = 0
+    keys, key_directions, radii = np.zeros((KEYS, 3)), np.zeros((KEYS, 3)), np.zeros(KEYS)
+    key_directions[:, 2] = 1
+    for number in range(KEYS):
+        found = _take_key(radiance, toward, angle)
+        if found is None:
+            break
+        keys[number], key_directions[number], radii[number] = found
+    bounce = np.zeros(3)
+    if ground is not None:
+        up = (radiance * angle[..., None] * np.maximum(toward[..., 2:], 0)).sum(axis=(0, 1)) / np.pi
+        up += (keys * np.maximum(key_directions[:, 2:], 0)).sum(axis=0)
+        bounce = up * linear(cv2.resize(ground.albedo, (1, 1), interpolation=cv2.INTER_AREA)[0, 0] / 255.0)
+        radiance[toward[..., 2] <= 0] = bounce
+    power = (radiance * angle[..., None]).reshape(-1, 3)
+    harmonics = (_COSINE * _NORM * _NORM / np.pi)[:, None] * (basis(toward).reshape(-1, 9).T @ power)
+    samples, weights = _samples(key_directions, radii, toward.reshape(-1, 3), power @ LUMINANCE)
+    weights[: KEYS * KEY_SAMPLES] *= np.repeat(keys.any(axis=1), KEY_SAMPLES)
+    white = _white(harmonics, keys, key_directions)
+    exposure = GREY_CARD * light.strength / USUAL_STRENGTH / max(white, 1e-6)
+    return Lights(harmonics, keys, key_directions, samples, weights, bounce, exposure)
+
+
+def _take_key(radiance: Floats, toward: Floats, angle: Floats) -> tuple[Floats, Floats, float] | None:
+    """The strongest light of a panorama (colour, direction, radius in radians), which is taken out of it."""
+    bright = radiance @ LUMINANCE
+    order = np.argsort(bright, axis=None)
+    share = np.cumsum(np.broadcast_to(angle, bright.shape).ravel()[order])
+    usual = bright.ravel()[order][np.searchsorted(share, 0.8 * share[-1])]
+    excess = np.maximum(bright - 2.0 * usual, 0) * angle
+    if not excess.any():
+        return None
+    wide = cv2.copyMakeBorder(excess, 0, 0, 8, 8, cv2.BORDER_WRAP)
+    blurred = cv2.GaussianBlur(wide, (0, 0), 2.5)[:, 8:-8]
+    peak = toward[np.unravel_index(np.argmax(blurred), blurred.shape)]
+    near = np.where(toward @ peak > np.cos(np.radians(KEY_REACH_DEG)), excess, 0)
+    total = near.sum()
+    if total < 0.06 * (bright * angle).sum():
+        return None
+    direction = (near[..., None] * toward).sum(axis=(0, 1))
+    direction /= max(float(np.linalg.norm(direction)), 1e-12)
+    away = np.arccos(np.clip(toward @ direction, -1, 1))
+    radius = float(np.sqrt(2 * (near * away**2).sum() / total))
+    taken = near / np.maximum(bright * angle, 1e-12)
+    colour = (radiance * (taken * angle)[..., None]).sum(axis=(0, 1)) / np.pi
+    radiance *= 1 - taken[..., None]
+    return colour, direction, float(np.clip(radius, *np.radians(KEY_RADIUS_DEG)))
+
+
+def _samples(keys: Floats, radii: Floats, toward: Floats, power: Floats) -> tuple[Floats, Floats]:
+    """Directions (DIRECTIONS, 3) and their weights: discs of the key lights, then the sphere."""
+    number = np.arange(KEY_SAMPLES) + 0.5
+    golden = np.pi * (3 - np.sqrt(5))
+    radius, around = np.sqrt(number / KEY_SAMPLES), golden * number
+    discs = []
+    for key, size in zip(keys, np.tan(radii), strict=True):
+        across, along = frame_of(key)
+        disc = key + size * radius[:, None] * (np.outer(np.cos(around), across) + np.outer(np.sin(around), along))
+        discs.append(disc / np.linalg.norm(disc, axis=1, keepdims=True))
+    number = np.arange(AMBIENT_SAMPLES) + 0.5
+    z = 1 - 2 * number / AMBIENT_SAMPLES
+    flat = np.sqrt(1 - z * z)
+    sphere = np.column_stack([flat * np.cos(golden * number), flat * np.sin(golden * number), z])
+    nearest = np.argmax(toward @ sphere.T, axis=1)
+    weights = np.bincount(nearest, power, AMBIENT_SAMPLES)
+    shares = np.full(KEYS * KEY_SAMPLES, 1 / KEY_SAMPLES)
+    return np.concatenate([*discs, sphere]), np.concatenate([shares, weights])
+
+
+def frame_of(directions: Floats) -> tuple[Floats, Floats]:
+    """Two unit vectors (..., 3) that stand upright on unit vectors (..., 3) and on each other."""
+    x, y, z = np.moveaxis(directions, -1, 0)
+    steep = np.abs(z) > 0.9
+    zero = np.zeros_like(z)
+    across = np.stack([np.where(steep, zero, -y), np.where(steep, -z, x), np.where(steep, y, zero)], axis=-1)
+    across /= np.linalg.norm(across, axis=-1, keepdims=True)
+    a, b, c = np.moveaxis(across, -1, 0)
+    return across, np.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=-1)
+
+
+def _white(harmonics: Floats, keys: Floats, key_directions: Floats) -> float:
+    """Mean luminance of a white object: of surfaces that look up and to all sides."""
+    normals = np.array([[0, 0, 1.0], [0, 0, 1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
+    light = basis(normals) @ harmonics + np.maximum(normals @ key_directions.T, 0) @ keys
+    return float((np.maximum(light, 0) @ LUMINANCE).mean())
