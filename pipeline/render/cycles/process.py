@@ -54,16 +54,16 @@ class BlenderProcess:
         python: interpreter with bpy.
         folder: private, for what Blender prints and leaves behind.
         limits: its memory.
-        script: what it runs.
+        script: what it runs; None: blender/worker.py.
 
     Raises:
         DopeError: it did not start, or has no bpy.
     """
 
-    def __init__(self, python: str, folder: Path, limits: Limits, script: Path = WORKER) -> None:
+    def __init__(self, python: str, folder: Path, limits: Limits, script: Path | None = None) -> None:
         self._limits, self._unread = limits, b""
         self._log = folder / "blender.log"
-        command = [python, "-u", str(script), str(os.getpid()), str(int(limits.memory_gib * 2**30))]
+        command = [python, "-u", str(script or WORKER), str(os.getpid()), str(int(limits.memory_gib * 2**30))]
         try:
             with self._log.open("ab") as log:  # appending, so that it can be emptied between objects
                 self._process = subprocess.Popen(
@@ -114,7 +114,7 @@ class BlenderProcess:
         except TimeoutError:
             self.close()
             raise ChildFailed(
-                f"Blender took longer than its time and was stopped{self._said()}",
+                f"Blender took longer than the object's {self._limits.minutes:g} minutes and was stopped{self._said()}",
                 remedy="Fewer samples (--set cycles.samples=N) or smaller pictures take less",
             ) from None
         except (EOFError, BrokenPipeError, ConnectionResetError):
@@ -163,7 +163,7 @@ class BlenderProcess:
 
     def _cause_of_death(self) -> str:
         try:
-            code: int | None = self._process.wait(5)
+            code: int | None = self._process.wait(2)
         except subprocess.TimeoutExpired:  # it has closed its stdout, and lives
             code = None
         self.close()

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dope.common.errors import BadInput
-from pipeline.children import ChildFailed, Limits
+from pipeline.children import Limits
 from pipeline.render.config import CyclesConfig
 from pipeline.render.cycles import process
 from pipeline.render.cycles.exchange import read_picture, scene_message, shot_message
@@ -40,7 +40,7 @@ class CyclesRenderer:
         self._python = process.find_python(config.python)
         self._folder = PrivateFolder()
         self._process: process.BlenderProcess | None = None
-        self._objects = 0
+        self._objects = self._begun = 0
         self._cleanup = weakref.finalize(self, self._folder.close)
         try:
             blender = self._ready().blender
@@ -56,24 +56,24 @@ class CyclesRenderer:
             BadInput: Blender could not render it, crashed on it or took too long; the next scene gets a new process.
             DopeError: Blender could not be started.
         """
-        message = scene_message(scene, self._config, self._limits.threads, self._folder.path / "scene.npz")
-        shots = [shot_message(shot, self._folder.path / "shot.exr") for shot in scene.shots]
+        folder = self._folder.path
+        message = scene_message(scene, self._config, self._limits.threads, folder / "scene.npz")
+        requests = [shot_message(shot, folder / "shot.exr") for shot in scene.shots]
         blender = self._ready()
         self._objects += 1
-        number, left = self._objects, self._limits.minutes * 60
-        left = self._ask(blender, message, left)
-        Path(message["file"]).unlink()
-        for shot, request in zip(scene.shots, shots, strict=True):
-            if number != self._objects:
+        self._begun = begun = self._begun + 1
+        left = self._ask(blender, message, self._limits.minutes * 60)
+        (folder / "scene.npz").unlink()
+        for shot, request in zip(scene.shots, requests, strict=True):
+            if begun != self._begun:
                 raise RuntimeError("another scene was begun before this one was done")
             left = self._ask(blender, request, left)
-            file = Path(request["file"])
             try:
-                picture = read_picture(file, shot)
+                picture = read_picture(folder / "shot.exr", shot)
             except (OSError, ValueError) as error:
                 self._end()
                 raise BadInput(f"Blender's picture cannot be read: {error}") from None
-            file.unlink()  # so that it cannot be taken for the next
+            (folder / "shot.exr").unlink()  # so that it cannot be taken for the next
             yield picture
 
     def close(self) -> None:
@@ -95,15 +95,15 @@ class CyclesRenderer:
         start = time.monotonic()
         try:
             answer = blender.ask(message, start + left)
-        except BaseException as error:
+        except BaseException:
             self._end()
-            if isinstance(error, ChildFailed) and left <= time.monotonic() - start:
-                error = ChildFailed(f"took longer than {self._limits.minutes:g} minutes: {error.what}", remedy=error.remedy)
-            raise error
-        if "error" in answer:
-            self._end()
-            raise BadInput(f"Blender could not render it: {answer['error']}")
-        return left - (time.monotonic() - start)
+            raise
+        if "error" not in answer:
+            return left - (time.monotonic() - start)
+        self._end()
+        if "MemoryError" in answer["error"]:
+            raise BadInput(f"Blender needed more than {self._limits.memory_gib:g} GiB of memory")
+        raise BadInput(f"Blender could not render it: {answer['error']}")
 
     def _end(self) -> None:
         if self._process is not None:
