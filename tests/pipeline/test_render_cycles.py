@@ -22,6 +22,7 @@ from tests.pipeline.render_scenes import (
     ground,
     look_at,
     plane_depth,
+    rays,
     small_scene,
     sphere,
     sphere_depth,
@@ -31,7 +32,7 @@ pytestmark = pytest.mark.skipif(
     not os.environ.get(VARIABLE), reason=f"needs an interpreter with bpy, named by ${VARIABLE}"
 )
 HALF = np.array([0.5, 0.4, 0.3])
-CHEAP = CyclesConfig(samples=1, denoise=False, bounces=1)
+CHEAP = CyclesConfig(samples=4, denoise=False, bounces=1)
 
 
 @pytest.fixture(scope="module")
@@ -57,16 +58,15 @@ CAMERAS = {
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
 def test_mask_and_depth_of_a_box_on_the_ground_are_exact(blender: CyclesRenderer, camera: Camera) -> None:
     picture = render_one(blender, small_scene(camera, on=ground(-0.3)))
-    solid, plane = box_depth(camera, HALF), plane_depth(camera, -0.3)
+    solid, plane = box_depth(camera, HALF), plane_depth(camera, -0.3 - 1e-5)
     assert np.count_nonzero(picture.mask != (solid < np.inf)) <= 1  # a ray along an edge may go either way
-    expected = np.minimum(solid, plane)
     same = picture.mask == (solid < np.inf)
-    expected = np.where(expected < 3000, expected, 0)
-    assert picture.mask.sum() > 100
-    near = same & (expected > 0) & (expected < 50)
-    np.testing.assert_allclose(picture.depth[near], expected[near], rtol=0, atol=1e-4 + 1e-5 * expected[near].max())
-    assert np.abs(picture.depth - expected)[picture.mask & same].max() < 3e-6
-    assert (picture.depth[plane == np.inf] == 0)[~picture.mask[plane == np.inf]].all()
+    expected = np.minimum(solid, plane)
+    assert picture.mask.sum() > 100 and np.abs(picture.depth - expected)[picture.mask & same].max() < 3e-6
+    near, sky = same & (expected < 50), same & (expected == np.inf)
+    assert np.abs(picture.depth / expected - 1)[near].max() < 1e-5
+    assert (picture.depth[sky] == 0).all()
+    assert (picture.depth[same & (expected < 1000)] > 0).all()
 
 
 def test_mask_and_depth_of_a_sphere_are_exact_up_to_its_facets(blender: CyclesRenderer) -> None:
@@ -76,8 +76,8 @@ def test_mask_and_depth_of_a_sphere_are_exact_up_to_its_facets(blender: CyclesRe
     assert np.count_nonzero(picture.mask != (expected < np.inf)) <= 3
     both = picture.mask & (expected < np.inf)
     error = picture.depth[both] - expected[both]
-    assert np.median(error) < 1e-4 and error.min() > -1e-6  # chords of 256 facets lie up to 7.5e-5 within
-    assert np.quantile(error, 0.98) < 2e-3  # at the outline the ray grazes
+    # its chords lie up to 7.5e-5 within; at the outline, where the ray grazes, that is more along the ray
+    assert np.median(error) < 1e-4 and np.quantile(error, 0.01) > -1e-6 and np.quantile(error, 0.98) < 2e-3
 
 
 def test_pairs_agree(blender: CyclesRenderer) -> None:
@@ -145,10 +145,10 @@ UV = np.array([(0.0, 0.0), (1, 0), (1, 1), (0, 1)])
 RED, GREEN, BLUE, WHITE = (200, 40, 40), (40, 200, 40), (40, 40, 200), (200, 200, 200)
 
 
-def quarters(image: np.ndarray) -> list[str]:
-    """Which channel leads in the quarters of the card: top left, top right, bottom left, bottom right."""
+def corners(image: np.ndarray) -> list[str]:
+    """Which channel leads in the corners of the card: top left, top right, bottom left, bottom right."""
     names = []
-    for y, x in ((24, 24), (24, 40), (40, 24), (40, 40)):
+    for y, x in ((17, 17), (17, 46), (46, 17), (46, 46)):
         pixel = image[y, x].astype(int)
         names.append("w" if pixel.max() - pixel.min() < 20 else "rgb"[int(pixel.argmax())])
     return names
@@ -157,11 +157,11 @@ def quarters(image: np.ndarray) -> list[str]:
 def test_textures_lie_as_their_coordinates_say(blender: CyclesRenderer) -> None:
     texture = np.repeat(np.repeat(np.array([[RED, GREEN], [BLUE, WHITE]], np.uint8), 8, axis=0), 8, axis=1)
     picture = render_one(blender, facing(card(uv=UV, texture=texture)))
-    assert quarters(picture.image) == ["r", "g", "b", "w"]
+    assert corners(picture.image) == ["r", "g", "b", "w"]
     tinted = render_one(blender, facing(card(uv=UV, texture=texture, colour=(1.0, 0.2, 0.2))))
-    assert quarters(tinted.image)[0::3] == ["r", "r"]
+    assert corners(tinted.image)[0::3] == ["r", "r"]
     shifted = render_one(blender, facing(card(uv=UV + (0.5, 0), texture=texture)))  # wraps around
-    assert quarters(shifted.image) == ["g", "r", "w", "b"]
+    assert corners(shifted.image) == ["g", "r", "w", "b"]
 
 
 def test_brightness_is_that_of_albedo_under_even_light(blender: CyclesRenderer) -> None:
@@ -177,13 +177,13 @@ def test_brightness_is_that_of_albedo_under_even_light(blender: CyclesRenderer) 
 def test_vertices_have_colours(blender: CyclesRenderer) -> None:
     colours = np.array([BLUE, WHITE, GREEN, RED]) / 255.0
     picture = render_one(blender, facing(card(colours=colours)))
-    assert quarters(picture.image) == ["r", "g", "b", "w"]
+    assert corners(picture.image) == ["r", "g", "b", "w"]
 
 
 def test_surfaces_of_one_colour_and_of_cells(blender: CyclesRenderer) -> None:
     own = card(colour=(0.1, 0.1, 0.9))
     plain = render_one(blender, facing(own, surface=Surface("colour", ((0.8, 0.1, 0.1),))))
-    assert quarters(plain.image) == ["r"] * 4
+    assert corners(plain.image) == ["r"] * 4
     palette = ((0.8, 0.1, 0.1), (0.1, 0.8, 0.1), (0.1, 0.1, 0.8))
     images = [
         render_one(blender, facing(own, surface=Surface("voronoi", palette, cells=8.0, seed=seed))).image
@@ -204,7 +204,7 @@ def test_the_ground_moves_with_the_objects_place(blender: CyclesRenderer) -> Non
     places = ((2.0, 0.0), (6.0, 0.0), (-2.0 - 8e4, 0.0), (3.8, 0.0))
     scene = dataclasses.replace(scene, shots=tuple(Shot(camera, place) for place in places))
     red, green, far_green, left_right = (picture.image[40].astype(int) for picture in blender.render(scene))
-    assert (red[:, 0] > red[:, 1]).all() and (green[:, 1] > green[:, 0]).all()
+    assert (red[:, 0] >= red[:, 1]).all() and (green[:, 1] >= green[:, 0]).all() and red[:, 0].mean() > 100
     np.testing.assert_array_equal(far_green, green)
     assert left_right[0, 0] > left_right[0, 1] and left_right[-1, 1] > left_right[-1, 0]
 
@@ -213,30 +213,32 @@ def test_bumps_show_and_leave_depth_alone(blender: CyclesRenderer) -> None:
     camera = look_at(0.0, 0.5, 2.0)
     waves = (0.03 * np.sin(np.arange(64) * 2 * np.pi / 16)).astype(np.float32)[None].repeat(64, axis=0)
     sky = np.full((16, 32, 3), 0.05, np.float32)
-    sky[4, 16] = 40.0
+    sky[3:6, 14:19] = 4.0
     flat, rough = (
         render_one(blender, small_scene(camera, on=ground(-0.3, bumps=bumps), light=Light(sky)))
         for bumps in (None, waves)
     )
     np.testing.assert_array_equal(flat.depth, rough.depth)
-    beside = ~flat.mask
-    assert rough.image[beside].astype(float).std() > 2 * flat.image[beside].astype(float).std()
+    rows = [picture.image[40:, :, 1].mean(axis=1) for picture in (flat, rough)]  # the waves run away from the camera
+    assert np.ptp(rows[0]) < 10 < 20 < np.ptp(rows[1])
+    x = (camera.centre + rays(camera) * flat.depth[..., None])[40:, 32, 0]
+    towards_light = -np.cos(2 * np.pi * x / 0.5)
+    assert np.corrcoef(towards_light, rows[1])[0, 1] > 0.9
 
 
 def test_normals_of_the_file_make_it_smooth(blender: CyclesRenderer) -> None:
     coarse = sphere(rings=6)
-    sky = np.full((16, 32, 3), 0.05, np.float32)
-    sky[4, 14:18] = 20.0
+    elevation = np.pi / 2 - (np.arange(64) + 0.5) / 64 * np.pi
+    sky = np.repeat(0.05 + 3 * np.maximum(np.sin(elevation), 0) ** 2, 128 * 3).reshape(64, 128, 3).astype(np.float32)
     camera = look_at(0.0, 1.2, 2.0, f=(90.0, 90.0))
     flat, smooth = (
         render_one(blender, small_scene(camera, part=part, light=Light(sky))).image.astype(float)
         for part in (dataclasses.replace(coarse, normals=None), coarse)
     )
-
-    def jumps(image: np.ndarray) -> float:
-        return float(np.quantile(np.abs(np.diff(image[20:44, 20:44, 1], axis=1)), 0.98))
-
-    assert jumps(smooth) < 0.6 * jumps(flat)
+    profiles = [image[20:44, 22:42, 1].mean(axis=1) for image in (flat, smooth)]
+    assert all(np.ptp(profile) > 30 for profile in profiles)
+    steps = [np.abs(np.diff(profile)).max() for profile in profiles]
+    assert steps[1] < 0.5 * steps[0]
 
 
 def test_what_lies_flat_on_the_ground_is_seen(blender: CyclesRenderer) -> None:
@@ -275,5 +277,5 @@ def test_parts_have_each_their_own_look(blender: CyclesRenderer) -> None:
     right = dataclasses.replace(card(colour=(0.1, 0.8, 0.1)), vertices=card().vertices * (1, 0.5, 1) + (0, 0.25, 0))
     scene = dataclasses.replace(facing(card()), model=Model((left, right)))
     picture = render_one(blender, scene)
-    assert quarters(picture.image) == ["r", "g", "r", "g"]
+    assert corners(picture.image) == ["r", "g", "r", "g"]
     assert picture.mask[32, 20] and picture.mask[32, 44]

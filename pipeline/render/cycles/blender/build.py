@@ -10,8 +10,14 @@ import shading
 
 GROUND_REACH = 4096.0
 """Half the side of the plane: its edge lies 0.02 px below the true horizon for a camera one unit above it."""
-GROUND_GAP = 2e-5
-"""The plane lies this much lower than it is said to, so that what lies flat on it is seen; 0.003 px."""
+GROUND_GAP = 1e-5
+"""The plane lies this much lower than it is said to, so that what lies flat on it is seen; 0.002 px."""
+
+FILTER_PX = 1.5
+"""Width of the pixels' filter (Blackman-Harris)."""
+FIRST_SAMPLE_PX = 5.26e-4
+"""The first sample, which gives mask and depth, is meant for the pixel's centre and lies this much right and up of it:
+Cycles reads its place from a table of the filter. Measured (Blender 4.5.15); with it depth is exact to 2e-6."""
 
 
 def build(message: dict[str, Any], arrays: dict[str, Any]) -> Any:
@@ -114,6 +120,7 @@ def set_up_cycles(scene: Any, settings: dict[str, Any], seed: int) -> None:
     render.use_compositing = render.use_sequencer = render.film_transparent = False
     cycles.device = "CPU"
     cycles.samples, cycles.seed = settings["samples"], seed
+    cycles.pixel_filter_type, cycles.filter_width = "BLACKMAN_HARRIS", FILTER_PX
     cycles.use_adaptive_sampling = cycles.use_auto_tile = False
     cycles.max_bounces = settings["bounces"]
     cycles.diffuse_bounces = cycles.glossy_bounces = cycles.transmission_bounces = settings["bounces"]
@@ -144,6 +151,7 @@ def place_shot(scene: Any, shot: dict[str, Any], ground: Any) -> None:
     import mathutils
 
     (fx, fy, cx, cy), width, height = shot["intrinsics"], shot["width"], shot["height"]
+    cx, cy = cx + FIRST_SAMPLE_PX, cy - FIRST_SAMPLE_PX
     render, camera = scene.render, scene.camera.data
     render.resolution_x, render.resolution_y, render.resolution_percentage = width, height, 100
     render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, fy / fx), max(1.0, fx / fy)

@@ -21,19 +21,22 @@ def to_linear(srgb: Any) -> Any:
 
 def byte_image(name: str, pixels: Any) -> Any:
     """(H, W, 3) uint8 sRGB, first row at the top, as an image of Blender's."""
-    return _image(name, pixels.astype(np.float32) / 255, is_float=False)
+    return _image(name, pixels.astype(np.float32) / 255, is_float=False, is_data=False)
 
 
 def float_image(name: str, pixels: Any) -> Any:
-    """(H, W) or (H, W, 3) linear, first row at the top, as an image of Blender's."""
-    if pixels.ndim == 2:
-        pixels = np.repeat(pixels[..., None], 3, axis=2)
-    return _image(name, pixels.astype(np.float32), is_float=True)
+    """(H, W, 3) linear light, first row at the top, as an image of Blender's."""
+    return _image(name, pixels.astype(np.float32), is_float=True, is_data=False)
 
 
-def _image(name: str, pixels: Any, *, is_float: bool) -> Any:
+def data_image(name: str, numbers: Any) -> Any:
+    """(H, W) numbers that are no colours, first row at the top, as an image of Blender's."""
+    return _image(name, numbers[..., None].astype(np.float32), is_float=True, is_data=True)
+
+
+def _image(name: str, pixels: Any, *, is_float: bool, is_data: bool) -> Any:
     height, width = pixels.shape[:2]
-    image = bpy.data.images.new(name, width, height, alpha=False, float_buffer=is_float)
+    image = bpy.data.images.new(name, width, height, alpha=False, float_buffer=is_float, is_data=is_data)
     rgba = np.ones((height, width, 4), np.float32)
     rgba[..., :3] = pixels[::-1]  # Blender counts rows from below
     image.pixels.foreach_set(rgba.ravel())
@@ -132,8 +135,7 @@ def ground_material(ground: dict[str, Any], arrays: dict[str, Any]) -> tuple[Any
     colour = nodes.add("ShaderNodeTexImage", {"Vector": mapping.outputs["Vector"]}, image=albedo).outputs["Color"]
     normal = None
     if "bumps" in arrays:
-        bumps = float_image("bumps", arrays["bumps"])
-        bumps.colorspace_settings.name = "Non-Color"
+        bumps = data_image("bumps", arrays["bumps"])
         # cubic: between the pixels of a linear one the slope jumps, and facets show
         where = {"Vector": mapping.outputs["Vector"]}
         height = nodes.add("ShaderNodeTexImage", where, image=bumps, interpolation="Cubic").outputs["Color"]
