@@ -10,9 +10,7 @@ from pipeline.render.scene import Ground, Light, Model, Part, Scene, Shot, Surfa
 
 def look_at(azimuth: float, zenith: float, distance: float, size=(64, 64), f=(53.3, 53.3), centre=None) -> Camera:
     """A camera that looks at the origin, upright; angles in radians, size (width, height) and f in pixels."""
-    position = distance * np.array(
-        [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)]
-    )
+    position = distance * np.array([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)])
     z = -position / distance
     x = np.cross(z, [0.0, 0.0, 1.0])
     x /= np.linalg.norm(x)

@@ -160,7 +160,7 @@ def test_textures_lie_as_their_coordinates_say(blender: CyclesRenderer) -> None:
     assert corners(picture.image) == ["r", "g", "b", "w"]
     tinted = render_one(blender, facing(card(uv=UV, texture=texture, colour=(1.0, 0.2, 0.2))))
     assert corners(tinted.image)[0::3] == ["r", "r"]
-    shifted = render_one(blender, facing(card(uv=UV + (0.5, 0), texture=texture)))  # wraps around
+    shifted = render_one(blender, facing(card(uv=UV + np.array([0.5, 0]), texture=texture)))  # wraps around
     assert corners(shifted.image) == ["g", "r", "w", "b"]
 
 
@@ -214,8 +214,9 @@ def test_bumps_show_and_leave_depth_alone(blender: CyclesRenderer) -> None:
     waves = (0.03 * np.sin(np.arange(64) * 2 * np.pi / 16)).astype(np.float32)[None].repeat(64, axis=0)
     sky = np.full((16, 32, 3), 0.05, np.float32)
     sky[3:6, 14:19] = 4.0
+    speck = box((0.01, 0.01, 0.01))
     flat, rough = (
-        render_one(blender, small_scene(camera, on=ground(-0.3, bumps=bumps), light=Light(sky)))
+        render_one(blender, small_scene(camera, part=speck, on=ground(-0.3, bumps=bumps), light=Light(sky)))
         for bumps in (None, waves)
     )
     np.testing.assert_array_equal(flat.depth, rough.depth)

@@ -9,6 +9,7 @@ import struct
 import subprocess
 import sys
 import time
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -148,7 +149,7 @@ def test_a_process_is_replaced_after_so_many_objects_and_when_it_has_died(
         if number == 2:
             os.kill(pids[-1], signal.SIGKILL)
             blender._process._process.wait()
-    assert [a == b for a, b in zip(pids, pids[1:], strict=False)] == [True, False, False, True]
+    assert [a == b for a, b in pairwise(pids)] == [True, False, False, True]
 
 
 def test_arrays_that_would_crash_blender_are_refused(blender: CyclesRenderer) -> None:
@@ -185,7 +186,7 @@ def test_no_blender_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.Monke
 def test_an_interpreter_without_bpy_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "bpy.py").write_text("raise ImportError('no bpy in here')\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    with pytest.raises(DopeError, match="did not start: no bpy: no bpy in here.*pip install"):
+    with pytest.raises(DopeError, match=r"did not start: no bpy: no bpy in here.*pip install"):
         CyclesRenderer(HERE)
     (tmp_path / "bpy.py").write_text("import os\nos.write(2, b'libXi.so.6 is missing')\nos.abort()\n")
     with pytest.raises(DopeError, match=r"did not start: Blender was ended by SIGABRT.*libXi\.so\.6 is missing"):
@@ -290,5 +291,3 @@ def test_exr_files_that_are_something_else_are_refused(tmp_path: Path) -> None:
         path.write_bytes(whole[:end])
         with pytest.raises(ValueError):
             read_exr(path)
-
-

@@ -23,7 +23,7 @@ def scene_message(scene: Scene, config: CyclesConfig, threads: int, file: Path) 
     Raises:
         BadInput: arrays that would crash Blender: indices that point nowhere, numbers that are not finite.
     """
-    arrays: dict[str, NDArray[Any]] = {"panorama": scene.light.panorama}
+    arrays: dict[str, Any] = {"panorama": scene.light.panorama}
     parts = []
     for i, part in enumerate(scene.model.parts):
         own: dict[str, NDArray[Any] | None] = {

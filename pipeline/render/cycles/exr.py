@@ -33,7 +33,9 @@ def read_exr(path: Path) -> dict[str, NDArray[np.float32]]:
     except (struct.error, KeyError, IndexError) as error:
         raise ValueError(f"no EXR header: {error!r}") from None
     width, height = x2 - x1 + 1, y2 - y1 + 1
-    row = np.dtype([("y", "<i4"), ("size", "<i4"), *((f"c{i}", kind, (width,)) for i, (_, kind) in enumerate(channels))])
+    row = np.dtype(
+        [("y", "<i4"), ("size", "<i4"), *((f"c{i}", kind, (width,)) for i, (_, kind) in enumerate(channels))]
+    )
     if len(data) < place + height * (8 + row.itemsize):
         raise ValueError(f"ends after {len(data)} bytes")
     rows = np.frombuffer(data, row, count=height, offset=place + 8 * height)

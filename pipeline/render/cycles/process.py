@@ -42,8 +42,8 @@ def find_python(setting: str | None) -> str:
 def how_to_install() -> str:
     return (
         "Blender wants an environment of its own (Python 3.11): `python3.11 -m venv bpyenv && "
-        "bpyenv/bin/pip install 'bpy==4.5.*' 'numpy<2'`, then say where it is: `--set cycles.python=bpyenv/bin/python`, "
-        f"or in the variable {VARIABLE}. Or render with `--renderer fast`"
+        "bpyenv/bin/pip install 'bpy==4.5.*' 'numpy<2'`, then say where it is: `--set "
+        f"cycles.python=bpyenv/bin/python`, or in the variable {VARIABLE}. Or render with `--renderer fast`"
     )
 
 

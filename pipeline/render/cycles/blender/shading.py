@@ -51,7 +51,7 @@ class Nodes:
         self.tree = tree
         tree.nodes.clear()
 
-    def add(self, kind: str, inputs: dict[str, Any] | None = None, **properties: Any) -> Any:
+    def add(self, kind: str, inputs: dict[Any, Any] | None = None, **properties: Any) -> Any:
         """A node; each input is a value, or the output of another node."""
         node = self.tree.nodes.new(kind)
         for name, value in properties.items():
@@ -120,7 +120,9 @@ def voronoi_material(surface: dict[str, Any]) -> Any:
     where = nodes.add("ShaderNodeCombineXYZ", {"X": number, "Y": 0.5}).outputs["Vector"]
     palette = np.round(np.asarray(surface["colours"], np.float32)[None] * 255).astype(np.uint8)
     image = byte_image("palette", palette)
-    colour = nodes.add("ShaderNodeTexImage", {"Vector": where}, image=image, interpolation="Closest", extension="EXTEND")
+    colour = nodes.add(
+        "ShaderNodeTexImage", {"Vector": where}, image=image, interpolation="Closest", extension="EXTEND"
+    )
     principled(nodes, colour.outputs["Color"], surface["roughness"])
     return material
 

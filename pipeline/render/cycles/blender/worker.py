@@ -2,8 +2,8 @@
 
     python worker.py PARENT_PID MEMORY_BYTES
 
-{"do": "scene", "file": NPZ, ...} builds a scene; {"do": "shot", ...} renders one shot of it into an EXR file. The answer
-is {"ok": true}, or {"error": TEXT}. Ends when stdin does, or when its parent dies.
+{"do": "scene", "file": NPZ, ...} builds a scene; {"do": "shot", ...} renders one shot of it into an EXR file. The
+answer is {"ok": true}, or {"error": TEXT}. Ends when stdin does, or when its parent dies.
 """
 
 from __future__ import annotations
