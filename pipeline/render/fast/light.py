@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pipeline.geometry import Floats
 from pipeline.render.fast.geometry import linear
 from pipeline.render.scene import Ground, Light
+from pipeline.render.skies import directions_of
 
 ROWS = 64
 """Rows of the panorama that lights are looked for in."""
@@ -66,16 +67,6 @@ def basis(directions: Floats) -> Floats:
 
 _NORM = np.array([0.282095, *[0.488603] * 3, 1.092548, 1.092548, 0.315392, 1.092548, 0.546274])
 _COSINE = np.array([np.pi, *[2 * np.pi / 3] * 3, *[np.pi / 4] * 5])
-
-
-def directions_of(rows: int, turn: float) -> tuple[Floats, Floats]:
-    """Directions (rows, 2 rows, 3) and solid angles (rows, 1) of the pixels of a panorama."""
-    elevation = np.pi / 2 - (np.arange(rows) + 0.5) * np.pi / rows
-    azimuth = (0.5 - (np.arange(2 * rows) + 0.5) / (2 * rows)) * 2 * np.pi + turn
-    flat = np.cos(elevation)[:, None]
-    shape = (rows, 2 * rows)
-    xyz = [flat * np.cos(azimuth), flat * np.sin(azimuth), np.broadcast_to(np.sin(elevation)[:, None], shape)]
-    return np.stack(xyz, axis=-1), flat * (np.pi / rows) ** 2
 
 
 def lights_of(light: Light, ground: Ground | None) -> Lights:
