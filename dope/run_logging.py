@@ -158,6 +158,11 @@ def describe_start(facts: dict[str, Any]) -> str:
         f"{facts['steps_per_epoch']:,} steps an epoch, {facts['total_steps']:,} in all",
         f"{facts['parameters'] / 1e6:.1f} M parameters, {facts['precision']}, {facts['device']}{ranks}",
     ]
+    if facts["warmup_steps"] >= facts["total_steps"]:
+        lines.append(
+            f"WARNING: the run ends before its {facts['warmup_steps']:,} steps of warm-up do: the learning rate never "
+            "reaches optimiser.lr. Lower schedule.warmup_steps, or raise schedule.epochs or data.pairs_per_object"
+        )
     if facts["left_out"]:
         lines.append(f"{facts['left_out']:,} pairs have too few correspondences (data.min_correspondences): left out")
     if facts["resumed_from"]:

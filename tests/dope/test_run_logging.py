@@ -12,7 +12,7 @@ from rich.console import Console
 
 from dope import run_logging
 from dope.common.errors import UsageError
-from dope.run_logging import RunLog, read_metrics
+from dope.run_logging import RunLog, describe_start, read_metrics
 from dope.wandb_run import require_wandb
 
 VALIDATION = {"pck": 0.25, "points": 40, "mask_iou": 0.5, "pairs": 2}
@@ -177,3 +177,10 @@ def test_progress_in_a_terminal_is_one_live_line(tmp_path: Path, monkeypatch: py
     assert "WARNING: /data/[old]/run[/b] " + "x" * 120 in text  # neither markup nor broken lines
     assert "3/3" in text and "loss 1.2500" in text and "PCK 0.250" in text and "data wait 3%" in text
     assert "\x1b[" in text
+
+
+def test_a_run_that_never_leaves_its_warm_up_is_told() -> None:
+    facts = dict.fromkeys(("pairs", "objects", "batch_size", "steps_per_epoch", "left_out", "resumed_at"), 1)
+    facts |= {"parameters": 1, "precision": "fp32", "device": "cpu", "world": 1, "resumed_from": None, "left_out": 0}
+    assert "warm-up" in describe_start(facts | {"total_steps": 1000, "warmup_steps": 1000})
+    assert "warm-up" not in describe_start(facts | {"total_steps": 1001, "warmup_steps": 1000})
