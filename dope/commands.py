@@ -230,13 +230,15 @@ def figure(
 
 def _print_training(result: dict[str, Any], out: Path) -> None:
     from rich.console import Console
+    from rich.markup import escape
 
     pck = "" if result["pck"] is None else f", held-out PCK {result['pck']:.1%}"
     if result["pck"] is not None and result["pck_untrained"] is not None:
         pck += f" (untrained {result['pck_untrained']:.1%})"
+    folder = escape(str(out))
     loss = "" if result["loss"] is None else f": loss {result['loss']:.3f}"
     Console(highlight=False).print(
-        f"{result['status']} at step {result['step']}{loss}{pck}; {result['seconds']:.0f} s; see [bold]{out}[/]",
+        f"{result['status']} at step {result['step']}{loss}{pck}; {result['seconds']:.0f} s; see [bold]{folder}[/]",
         soft_wrap=True,
     )
 

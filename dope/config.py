@@ -14,7 +14,8 @@ import yaml as pyyaml
 
 from dope.augmentation import AugmentationConfig
 from dope.common import files, settings
-from dope.common.errors import UsageError
+from dope.config_rules import check as check  # its callers need not know where the rules lie
+from dope.config_rules import flat
 from dope.networks import NetworkConfig
 from dope.order import Order
 from dope.preset_files import merged, preset_values
@@ -212,60 +213,12 @@ def write_config(path: Path, config: TrainConfig) -> None:
     files.write_bytes(path, f"# hash {settings.config_hash(config)}\n{text}".encode())
 
 
-def check(config: TrainConfig) -> None:
-    """Raise `UsageError` naming the first setting whose value makes no sense."""
-    data, schedule, network, augmentation = config.data, config.schedule, config.network, config.augmentation
-    keep_best = config.checkpoint.keep_best
-    rules = (
-        ("data.image_size", data.image_size >= 32 and data.image_size % 32 == 0, "must be a positive multiple of 32"),
-        ("data.batch_size", data.batch_size >= 2, "must be at least 2: the other pairs of a batch are the negatives"),
-        ("data.micro_batch", data.micro_batch >= 0, "must not be negative"),
-        ("data.pairs_per_object", data.pairs_per_object >= 1, "must be at least 1"),
-        ("data.points", data.points >= 1, "must be at least 1"),
-        ("data.max_points", data.max_points >= data.points, "must not be less than data.points"),
-        ("data.workers", data.workers >= 0, "must not be negative"),
-        ("data.block", data.block >= 1, "must be at least 1"),
-        ("data.min_correspondences", data.min_correspondences >= 0, "must not be negative"),
-        ("data.max_bad_samples", data.max_bad_samples >= 0, "must not be negative"),
-        ("network.width", network.width > 0, "must be positive"),
-        ("network.pyramid", network.pyramid >= 1, "must be at least 1"),
-        ("network.projector", bool(network.projector) and min(network.projector) >= 1, "must be one or more widths"),
-        ("augmentation.gamma", augmentation.gamma[0] > 0, "must be positive"),
-        ("augmentation.noise", 0 <= augmentation.noise <= 256, "must lie in [0, 256]"),
-        ("augmentation.largest_scale", augmentation.largest_scale > 0, "must be positive"),
-        ("loss.temperature", config.loss.temperature > 0, "must be positive"),
-        ("loss.mask_weight", config.loss.mask_weight >= 0, "must not be negative"),
-        ("loss.chunk", config.loss.chunk >= 1, "must be at least 1"),
-        ("optimiser.lr", config.optimiser.lr > 0, "must be positive"),
-        ("schedule.epochs", schedule.epochs >= 1, "must be at least 1"),
-        ("schedule.max_steps", schedule.max_steps >= 0, "must not be negative"),
-        ("schedule.warmup_steps", schedule.warmup_steps >= 0, "must not be negative"),
-        ("momentum", 0 <= config.momentum <= 1, "must lie in [0, 1]"),
-        ("validation.every", config.validation.every >= 0, "must not be negative"),
-        ("validation.pairs", config.validation.pairs >= 1, "must be at least 1 (validation.every=0 turns it off)"),
-        ("validation.batch_size", config.validation.batch_size >= 1, "must be at least 1"),
-        ("checkpoint.every", config.checkpoint.every >= 0, "must not be negative"),
-        ("checkpoint.every_steps", config.checkpoint.every_steps >= 0, "must not be negative"),
-        ("checkpoint.keep", config.checkpoint.keep >= 0, "must not be negative"),
-        ("checkpoint.keep_every", config.checkpoint.keep_every >= 0, "must not be negative"),
-        ("checkpoint.keep_best", not keep_best or config.validation.every > 0, "needs validation.every of 1 or more"),
-        ("log.every", config.log.every >= 1, "must be at least 1"),
-        ("log.pictures", config.log.pictures >= 0, "must not be negative"),
-    )
-    for key, ok, rule in rules:
-        if not ok:
-            value: Any = config
-            for part in key.split("."):
-                value = getattr(value, part)
-            raise UsageError(f"'{value}' {rule}", where=key, remedy=f"Change it with --set {key}=...")
-
-
 def differing_keys(ours: dict[str, Any], theirs: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
     """Settings that differ between two configs given as plain dicts: dotted key -> (ours, theirs).
 
     Those of `RESULT_NEUTRAL` are left out; a key that only one side has counts as None on the other.
     """
-    left, right = _flat(ours), _flat(theirs)
+    left, right = flat(ours), flat(theirs)
     return {
         key: (left.get(key), right.get(key))
         for key in sorted(left.keys() | right.keys())
@@ -277,13 +230,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _plain(inner) for key, inner in value.items()}
     return [_plain(inner) for inner in value] if isinstance(value, (list, tuple)) else value
-
-
-def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        if isinstance(value, dict):
-            flat |= _flat(value, f"{prefix}{key}.")
-        else:
-            flat[prefix + key] = list(value) if isinstance(value, tuple) else value
-    return flat

@@ -41,7 +41,7 @@ def examine() -> list[Finding]:
     findings = [Finding("python", "ok", sys.version.split()[0]), _machine()]
     findings += [_package(*entry) for entry in REQUIRED]
     findings += [_pycolmap(), _gpu(_version("torch") or "")]
-    findings += [_optional(*entry) for entry in OPTIONAL]
+    findings += [_compiler(), *(_optional(*entry) for entry in OPTIONAL)]
     return findings
 
 
@@ -51,12 +51,17 @@ REQUIRED = (
     ("numpy", "numpy"),
     ("pyarrow", "pyarrow"),
     ("webdataset", "webdataset"),
+    ("fsspec", "fsspec"),
+    ("pyyaml", "yaml"),
+    ("pycocotools", "pycocotools"),
     ("typer", "typer"),
+    ("rich", "rich"),
     ("tensorboard", "tensorboard"),
 )
 
 OPTIONAL = (
     ("Blender (bpy)", "bpy", "photoreal renders of meshes (planned)", "pip install '.[blender]' (Python 3.11 or 3.13)"),
+    ("OpenEXR", "OpenEXR", "depth maps in EXR files", "pip install 'dope-descriptors[exr]'"),
     ("Weights & Biases", "wandb", "--set log.wandb=PROJECT of dope train", "pip install 'dope-descriptors[wandb]'"),
     ("s3fs", "s3fs", "shards in s3://", "pip install '.[s3]'"),
     ("gcsfs", "gcsfs", "shards in gs://", "pip install '.[gs]'"),
@@ -103,6 +108,15 @@ def _nvidia_smi() -> str:
     except (subprocess.TimeoutExpired, OSError):
         return ""
     return "; ".join(answer.stdout.strip().splitlines()) if answer.returncode == 0 else ""
+
+
+def _compiler() -> Finding:
+    """What torch.compile calls; PyTorch brings none."""
+    purpose = "--set compile=true of dope train, which the preset fast has"
+    found = next(filter(None, map(shutil.which, (os.environ.get("CXX", "g++"), "g++", "clang++"))), None)
+    if found is None:
+        return Finding("C++ compiler", "optional", purpose, "e.g. apt-get install g++")
+    return Finding("C++ compiler", "ok", f"{found}: {purpose}")
 
 
 def _optional(what: str, module: str, purpose: str, remedy: str) -> Finding:

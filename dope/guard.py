@@ -44,7 +44,8 @@ def require_finite(run: Run, report: Mapping[str, float], batch: PairBatch, log:
     sequences = dict(zip(index.objects.tolist(), index.sequences.tolist(), strict=True))
     mine = [
         {"rank": run.ranks.rank, "key": key, "sequence": sequences[number]}
-        for key, number in zip(batch.keys, batch.objects.tolist(), strict=True)
+        for place, (key, number) in enumerate(zip(batch.keys, batch.objects.tolist(), strict=True))
+        if place not in batch.damaged  # what fills its place is another sample again, or none at all
     ]
     samples = [sample for part in run.ranks.collect(mine) for sample in part]
     keys, newest = [sample["key"] for sample in samples], checkpoints.latest_checkpoint(run.out)
@@ -59,6 +60,7 @@ def require_finite(run: Run, report: Mapping[str, float], batch: PairBatch, log:
     raise DopeError(
         f"the {NAMES[name]} is {report[name]} at step {step} ({reported}); the batch held {some}; all in {path.name}",
         where=run.out,
-        remedy="Lower --set optimiser.lr or raise --set schedule.warmup_steps, and look at these samples"
-        + (f"; {newest.name} was written before" if newest else ""),
+        # going on from the newest checkpoint would do these very steps again, and a run keeps its learning rate
+        remedy="Look at these samples; train anew into another --out with a lower --set optimiser.lr or a higher "
+        "--set schedule.warmup_steps" + (f"; {newest.name} holds the weights of before" if newest else ""),
     )

@@ -20,7 +20,8 @@ class StepProfiler:
     """Profiles `steps` steps of a training after two others; use as a context manager, call `step` after each one.
 
     RUN/profile/trace.json opens in https://ui.perfetto.dev or chrome://tracing; several ranks write
-    trace-rank0.json, trace-rank1.json and so on. A run that ends earlier writes the steps it had.
+    trace-rank0.json, trace-rank1.json and so on. A run that ends earlier writes the steps it had; one that ends within
+    the first two says that it writes none, and an older trace stays.
 
     Args:
         run: the run's folder.
@@ -32,6 +33,7 @@ class StepProfiler:
         name = "trace.json" if ranks.world == 1 else f"trace-rank{ranks.rank}.json"
         self._path, self._ranks, self._say = run / "profile" / name, ranks, say
         self._left = WARM_UP + steps if steps else 0
+        self._written = False
         self._profile: profile | None = None
         if steps:
             on_gpu = [ProfilerActivity.CUDA] if ranks.device.type == "cuda" else []
@@ -52,7 +54,7 @@ class StepProfiler:
         if self._profile:
             self._profile.stop()
             self._profile = None
-            if not self._path.exists() and self._ranks.is_first:
+            if not self._written and self._ranks.is_first:
                 self._say(f"the run ended within the {WARM_UP} steps that --profile leaves out: no trace was written")
 
     def step(self) -> None:
@@ -66,6 +68,7 @@ class StepProfiler:
     def _write(self, finished: profile) -> None:
         with files.atomic_path(self._path) as partial:
             finished.export_chrome_trace(str(partial))
+        self._written = True
         if self._ranks.is_first:
             self._say(f"{slowest_operators(finished)}\nprofile: {self._path}")
 

@@ -11,7 +11,7 @@ from torch.nn.parallel import DistributedDataParallel
 from dope.common.errors import UsageError
 from dope.config import TrainConfig
 from dope.losses import mask_loss
-from dope.networks import DopeNetwork
+from dope.networks import DopeNetwork, compiling
 from dope.networks.batchnorm import keeping_statistics, moving_statistics_once
 
 
@@ -26,7 +26,7 @@ class OnlineEncoder(nn.Module):
     def __init__(self, network: DopeNetwork, *, compiled: bool = False) -> None:
         super().__init__()
         self.network = network
-        self._forward = torch.compile(network.forward) if compiled else network.forward
+        self._forward = compiling.compiled(network.forward) if compiled else network.forward
 
     def forward(self, images: Tensor, cells: Tensor) -> tuple[Tensor, Tensor]:
         """(B, 3, H, W), (B, P, 2) to descriptors (B, P, D) and mask logits (B, 1, h, w)."""

@@ -95,6 +95,7 @@ class Run:
             "batch_size": self.config.data.batch_size,
             "steps_per_epoch": self.order.steps_per_epoch,
             "total_steps": self.total_steps,
+            "warmup_steps": self.config.schedule.warmup_steps,
             "parameters": sum(parameter.numel() for parameter in self.state.network.parameters()),
             "precision": resolved_precision(self.config.precision, self.ranks.device),
             "world": self.ranks.world,

@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from dope.common import files
 from dope.figures.drawing import Image, as_png
@@ -57,10 +57,10 @@ class RunLog:
                 TextColumn("{task.completed}/{task.total}"),
                 TextColumn("{task.description}"),
                 TimeElapsedColumn(),
-                TimeRemainingColumn(),
+                TextColumn("{task.fields[left]}"),
                 console=self._console,
             )
-            self._task = self._progress.add_task("", total=total, completed=start)
+            self._task = self._progress.add_task("", total=total, completed=start, left="")
         self._total, self._pck, self._line_due = total, "", 0.0
         self._began, self._began_at = time.perf_counter(), start
         self._wandb = WandbRun(wandb, run, config or {}, self.say) if wandb else None
@@ -111,18 +111,19 @@ class RunLog:
     def progress(self, step: int, meter: Meter) -> None:
         """Show where the run is: a live line in a terminal, else a plain line every few seconds."""
         speed = f"{meter.pairs_per_second:.1f} pairs/s  data wait {meter.data_wait:.0%}"
-        text = f"{speed}  loss {meter.loss:.4f}{self._pck}"
+        # not Rich's own estimate, which knows nothing where a step takes more than half a minute
+        seconds = (time.perf_counter() - self._began) / max(1, step - self._began_at) * (self._total - step)
+        text, left = f"{speed}  loss {meter.loss:.4f}{self._pck}", f"{timedelta(seconds=round(seconds))} left"
         if self._progress:
-            self._progress.update(self._task, completed=step, description=text)
+            self._progress.update(self._task, completed=step, description=text, left=left)
         elif time.perf_counter() >= self._line_due or step == self._total:
             self._line_due = time.perf_counter() + 5
-            left = (time.perf_counter() - self._began) / max(1, step - self._began_at) * (self._total - step)
-            self.say(f"step {step:6d}/{self._total}  {text}  {timedelta(seconds=round(left))} left")
+            self.say(f"step {step:6d}/{self._total}  {text}  {left}")
 
     def say(self, text: str) -> None:
         """Print a line above the progress."""
         if self._progress:
-            self._progress.console.print(text, highlight=False)
+            self._progress.console.print(text, markup=False, highlight=False, soft_wrap=True)
         else:
             print(text, file=sys.stderr, flush=True)
 
@@ -157,6 +158,11 @@ def describe_start(facts: dict[str, Any]) -> str:
         f"{facts['steps_per_epoch']:,} steps an epoch, {facts['total_steps']:,} in all",
         f"{facts['parameters'] / 1e6:.1f} M parameters, {facts['precision']}, {facts['device']}{ranks}",
     ]
+    if facts["warmup_steps"] >= facts["total_steps"]:
+        lines.append(
+            f"WARNING: the run ends before its {facts['warmup_steps']:,} steps of warm-up do: the learning rate never "
+            "reaches optimiser.lr. Lower schedule.warmup_steps, or raise schedule.epochs or data.pairs_per_object"
+        )
     if facts["left_out"]:
         lines.append(f"{facts['left_out']:,} pairs have too few correspondences (data.min_correspondences): left out")
     if facts["resumed_from"]:
@@ -165,15 +171,15 @@ def describe_start(facts: dict[str, Any]) -> str:
 
 
 def read_metrics(run: Path, event: str | None = None) -> list[dict[str, Any]]:
-    """The lines of RUN/metrics.jsonl (of one kind). A last line that was cut off by a crash is left out."""
+    """The lines of RUN/metrics.jsonl (of one kind). What a crash cut off or left of other things is left out."""
     lines = []
     path = run / METRICS
-    for text in path.read_text(encoding="utf-8").splitlines() if path.is_file() else []:
+    for text in path.read_bytes().splitlines() if path.is_file() else []:
         try:
             line = json.loads(text)
-        except ValueError:
+        except ValueError:  # bytes that are no UTF-8 as well
             continue
-        if event is None or line["event"] == event:
+        if isinstance(line, dict) and {"event", "step"} <= line.keys() and event in (None, line["event"]):
             lines.append(line)
     return lines
 

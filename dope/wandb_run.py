@@ -67,8 +67,9 @@ class WandbRun:
             self._try(lambda: self._run.finish(exit_code=int(failed)))
 
     def _begin(self, project: str, folder: Path, identity: str, config: Mapping[str, Any]) -> None:
+        name = folder.resolve().name  # "." has none
         self._run = self._wandb.init(
-            project=project, id=identity, resume="allow", name=folder.name, dir=str(folder), config=dict(config)
+            project=project, id=identity, resume="allow", name=name, dir=str(folder), config=dict(config)
         )
         # our own steps as the axis: W&B's only grow, and a resumed run may go back to a checkpoint
         self._run.define_metric("*", step_metric="step")

@@ -7,6 +7,7 @@ it). Unknown keys are errors that name the closest known key. `config_hash` iden
 from __future__ import annotations
 
 import dataclasses
+import datetime
 import difflib
 import hashlib
 import json
@@ -60,6 +61,9 @@ def from_mapping(cls: type[Config], values: Mapping[str, Any], *, where: str = "
 def override(config: Config, assignments: Iterable[str]) -> Config:
     """Apply `section.key=value` strings (values are YAML) to a config.
 
+    `section={key: value}` changes these keys of the section alone. Where a text is wanted, numbers, dates and nothing
+    at all are texts as well.
+
     Raises:
         UsageError: no "=", an unknown key, or a value that is no YAML or of the wrong type.
     """
@@ -69,11 +73,10 @@ def override(config: Config, assignments: Iterable[str]) -> Config:
             raise UsageError(f"'{assignment}' is not key=value", where="--set")
         where = f"--set {path.strip()}"
         try:
-            value = yaml.safe_load(text)
-        except yaml.YAMLError as error:
-            reason = str(error).replace("\n", " ")
-            raise UsageError(f"'{text}' is not valid YAML ({reason})", where=where) from error
-        config = _replace(config, path.strip().split("."), value, where)
+            value = _parsed(text)
+        except ValueError as error:
+            raise UsageError(f"'{text}' is not valid YAML ({error})", where=where) from error
+        config = _replace(config, path.strip().split("."), value, text.strip(), where)
     return config
 
 
@@ -89,18 +92,38 @@ def require_at_least(config: Any, **least: float) -> None:
 
 
 def load_yaml(path: Path) -> dict[str, Any]:
-    """Read a YAML mapping. Raises `UsageError` where it is absent, malformed or not a mapping."""
+    """Read a YAML mapping. Raises `UsageError` where it is absent, malformed, not a mapping, or has a key twice."""
     try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+        values = _parsed(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise UsageError(f"cannot be read ({error.strerror})", where=path) from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise UsageError(f"is not valid YAML ({error})", where=path) from error
     if values is None:
         return {}
     if not isinstance(values, dict):
         raise UsageError("must be a mapping of settings", where=path)
     return values
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """YAML in which a mapping that has a key twice is an error: PyYAML forgets the first value in silence."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
+            if isinstance(key, yaml.ScalarNode) and (key.tag, key.value) in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"'{key.value}' is there twice", key.start_mark)
+            seen.add((key.tag, str(key.value)))
+        return super().construct_mapping(node, deep)
+
+
+def _parsed(text: str) -> Any:
+    """The value of a YAML text. Raises `ValueError`, in one line, where it is malformed."""
+    try:
+        return yaml.load(text, _StrictLoader)
+    except (yaml.YAMLError, ValueError) as error:  # e.g. the 13th month is a plain ValueError
+        raise ValueError(" ".join(str(error).split())) from error
 
 
 def _require_setting(cls: type, key: str, where: str) -> None:
@@ -120,15 +143,33 @@ def _unknown(key: str, known: Iterable[str]) -> str:
     return f"unknown key '{key}' ({hint})"
 
 
-def _replace(config: Any, path: list[str], value: Any, where: str) -> Any:
-    _require_setting(type(config), path[0], where)
-    if len(path) == 1:
-        hint = typing.get_type_hints(type(config))[path[0]]
-        return dataclasses.replace(config, **{path[0]: _convert(hint, value, where)})
-    inner = getattr(config, path[0])
+def _replace(config: Any, path: list[str], value: Any, text: str, where: str) -> Any:
+    name, *below = path
+    _require_setting(type(config), name, where)
+    inner = getattr(config, name)
+    if not below:
+        return _updated(config, {name: _as_text(typing.get_type_hints(type(config))[name], value, text)}, where)
     if not dataclasses.is_dataclass(inner):
-        raise UsageError(f"'{path[0]}' has no settings below it", where=where)
-    return dataclasses.replace(config, **{path[0]: _replace(inner, path[1:], value, where)})
+        raise UsageError(f"'{name}' has no settings below it", where=where)
+    return dataclasses.replace(config, **{name: _replace(inner, below, value, text, where)})
+
+
+def _updated(config: Any, values: Mapping[str, Any], where: str) -> Any:
+    """The config with other values of some settings; a mapping for a section leaves its other settings as they are."""
+    hints, changes = typing.get_type_hints(type(config)), {}
+    for key, value in values.items():
+        _require_setting(type(config), str(key), where)
+        inner = getattr(config, key)
+        is_section = dataclasses.is_dataclass(inner) and isinstance(value, Mapping)
+        changes[key] = _updated(inner, value, where) if is_section else _convert(hints[key], value, where)
+    return dataclasses.replace(config, **changes)
+
+
+def _as_text(hint: Any, value: Any, text: str) -> Any:
+    """What was typed, where a text is wanted and YAML reads a number, a date or nothing in it."""
+    if hint is not str or isinstance(value, bool):
+        return value
+    return text if isinstance(value, (int, float, datetime.date)) or not text else value
 
 
 def _convert(hint: Any, value: Any, where: str) -> Any:
@@ -151,7 +192,10 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
         if len(kinds) == len(value):
             return tuple(_convert(kind, item, where) for kind, item in zip(kinds, value, strict=True))
     if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError:
+            pass
     if hint is float and isinstance(value, str):  # YAML 1.1 reads 1e-4 as a string
         try:
             return float(value)

@@ -52,11 +52,14 @@ def draw_figures(
         device: where the network runs.
 
     Raises:
-        UsageError: an unknown sequence (close ones are named), fewer than two views, or a point outside the view.
+        UsageError: an unknown sequence (close ones are named), fewer than two views, a limit below 1, or a point
+            outside the view.
         BadInput: shards or checkpoint cannot be used; or, once all others are drawn, a sequence shows no object.
     """
     if views < 2:
         raise UsageError(f"a figure needs at least 2 views, not {views}", where="--views")
+    if limit < 1:
+        raise UsageError(f"must be at least 1, not {limit}", where="--limit")
     found = ViewShards(shards)
     chosen = [(name, found.of_sequence(name)) for name in sequences or _first_sequences(found, limit)]
     for sequence, indices in chosen:

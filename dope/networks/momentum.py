@@ -7,6 +7,7 @@ import copy
 import torch
 from torch import Tensor, nn
 
+from dope.networks import compiling
 from dope.networks.dope import DopeNetwork, NetworkOutput
 
 
@@ -26,7 +27,7 @@ class MomentumEncoder(nn.Module):
         super().__init__()
         self.momentum = momentum
         self.network = copy.deepcopy(network).requires_grad_(False)
-        self._forward = torch.compile(self.network.forward) if compiled else self.network.forward
+        self._forward = compiling.compiled(self.network.forward) if compiled else self.network.forward
         self.train()
 
     @torch.no_grad()

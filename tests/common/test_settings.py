@@ -47,12 +47,38 @@ def test_override_reads_yaml_values() -> None:
         ("count=true", "not of type"),
         ("inner.sizes=[1, x]", "not of type"),
         ("count", "not key=value"),
+        ("inner={learning_rat: 1}", "did you mean 'learning_rate'"),
+        ("count={a: 1}", "not of type"),
+        ("inner.learning_rate=1" + "0" * 400, "not of type float"),
+        ("inner={mode: a, mode: b}", "'mode' is there twice"),
+        ("name=true", "not of type str"),
+        ("name=null", "not of type str"),
+        ("name=2024-13-45", r"--set name: '2024-13-45' is not valid YAML \(month must be in 1\.\.12\)"),
         ("inner.sizes=[1", r"--set inner\.sizes: '\[1' is not valid YAML"),
     ],
 )
 def test_wrong_assignments_are_named(assignment: str, message: str) -> None:
     with pytest.raises(UsageError, match=message):
         override(Outer(), [assignment])
+
+
+def test_a_mapping_changes_only_what_it_names() -> None:
+    config = override(Outer(Inner(0.5, (7,))), ["inner={mode: b}"])
+    assert config.inner == Inner(0.5, (7,), "b")
+
+
+@pytest.mark.parametrize("text", ["", "123", "2024-01-31", "1e5", "0x10"])
+def test_where_a_text_is_wanted_what_was_typed_is_one(text: str) -> None:
+    assert override(Outer(), [f"name={text}"]).name == text
+
+
+def test_a_key_that_a_file_has_twice_is_an_error(tmp_path) -> None:
+    path = tmp_path / "train.yaml"
+    path.write_text("inner: {mode: b}\ncount: 1\ninner: {learning_rate: 1}\n")
+    with pytest.raises(UsageError, match=r"train\.yaml: is not valid YAML \('inner' is there twice .*line 3"):
+        load_yaml(path)
+    path.write_text("a: &base {x: 1, y: 2}\nb: {<<: *base, x: 3}\n")
+    assert load_yaml(path)["b"] == {"x": 3, "y": 2}
 
 
 def test_unknown_key_in_a_file_names_the_file_and_the_closest_key(tmp_path) -> None:

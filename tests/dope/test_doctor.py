@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -56,3 +58,20 @@ def test_a_driver_that_hangs_is_no_crash(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(doctor.shutil, "which", lambda _: "nvidia-smi")
     monkeypatch.setattr(doctor.subprocess, "run", hang)
     assert doctor._gpu("2.9.0").state == "optional"
+
+
+def test_every_package_that_is_required_is_looked_for() -> None:
+    project = tomllib.loads((Path(doctor.__file__).parents[1] / "pyproject.toml").read_text())["project"]
+    required = {re.split("[<>=]", text)[0] for text in project["dependencies"]} - {"pycolmap"}
+    assert {distribution for distribution, _ in doctor.REQUIRED} == required
+    remedies = " ".join(remedy for *_, remedy in doctor.OPTIONAL)
+    extras = project["optional-dependencies"].keys() - {"dev"}
+    assert all(f"[{extra}]" in remedies for extra in extras)
+
+
+def test_a_machine_without_a_compiler_is_told_what_needs_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    finding = found("C++ compiler")
+    assert finding.state == "optional" and "compile=true" in finding.detail and "g++" in finding.remedy
+    (tmp_path / "clang++").touch(0o755)
+    assert found("C++ compiler").state == "ok"

@@ -220,6 +220,12 @@ def test_figures_of_sequences_in_shards(shards: Path, tmp_path: Path) -> None:
     assert held_out_first[0].read_bytes() == first
 
 
+@pytest.mark.parametrize("limit", [0, -1])
+def test_no_figure_at_all_is_an_error(shards: Path, tmp_path: Path, limit: int) -> None:
+    with pytest.raises(UsageError, match=f"^--limit: must be at least 1, not {limit}"):
+        list(draw_figures(None, shards, tmp_path, limit=limit))
+
+
 @pytest.mark.usefixtures("small_network")
 def test_unknown_sequences_and_too_few_views_are_explained(shards: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="did you mean 'shape0_object1'"):

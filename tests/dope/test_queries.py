@@ -13,10 +13,11 @@ import torch
 from tiny_shards import write_shards
 
 from dope.checkpoints import load_network
-from dope.common.errors import UsageError
+from dope.common.errors import BadInput, DopeError, UsageError
 from dope.config import TrainConfig, load_config
 from dope.distributed import Ranks
 from dope.memory import MemoryWatch
+from dope.networks.compiling import compiled
 from dope.queries import autocast, micro_batches
 from dope.run_logging import read_metrics
 from dope.state import new_state, wrap
@@ -161,3 +162,17 @@ def test_compiling_changes_no_key(shards: Path, tmp_path: Path, monkeypatch: pyt
     train(shards, tmp_path, tiny(*RUN, "schedule.max_steps=1", "compile=true"))
     assert compiled == [(4, 3, 32, 32)] * 2  # the momentum encoder and the online encoder
     assert set(load_network(tmp_path)[0].state_dict()) == set(new_state(tiny(), ALONE).network.state_dict())
+
+
+def test_what_cannot_be_compiled_is_explained_and_other_errors_pass(monkeypatch: pytest.MonkeyPatch) -> None:
+    from torch._dynamo.exc import TorchDynamoException
+
+    def compile_(function: Any) -> Any:
+        return lambda images: (_ for _ in ()).throw(images)
+
+    monkeypatch.setattr(torch, "compile", compile_)
+    fast: Any = compiled(abs)  # type: ignore[arg-type]
+    with pytest.raises(DopeError, match=r"^compile: torch.compile failed \(.*no compiler.*--set compile=false"):
+        fast(TorchDynamoException("no compiler\n\nand more"))
+    with pytest.raises(BadInput, match="97x97"):
+        fast(BadInput("images are 97x97 px"))

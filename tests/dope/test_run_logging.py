@@ -12,7 +12,7 @@ from rich.console import Console
 
 from dope import run_logging
 from dope.common.errors import UsageError
-from dope.run_logging import RunLog, read_metrics
+from dope.run_logging import RunLog, describe_start, read_metrics
 from dope.wandb_run import require_wandb
 
 VALIDATION = {"pck": 0.25, "points": 40, "mask_iou": 0.5, "pairs": 2}
@@ -111,6 +111,9 @@ def test_wandb_gets_numbers_and_pictures_and_one_run_goes_on(tmp_path: Path, mon
     assert wandb.ended == [0, 1, 0]
     first, again, other = wandb.begun
     assert (first["project"], first["name"], first["config"]) == ("mugs", tmp_path.name, {"seed": 1})
+    monkeypatch.chdir(tmp_path)
+    run_with_wandb(Path())
+    assert wandb.begun[-1]["name"] == tmp_path.name
     assert first["resume"] == "allow" and first["id"] == again["id"] != other["id"]
 
 
@@ -137,6 +140,14 @@ def test_a_run_that_begins_anew_forgets_what_a_killed_one_said(tmp_path: Path) -
     assert len(read_metrics(tmp_path)) == 1
 
 
+def test_lines_that_a_crash_spoilt_are_left_out(tmp_path: Path) -> None:
+    whole = b'{"event": "step", "step": 1}\n'
+    (tmp_path / "metrics.jsonl").write_bytes(b"\0\0\0\n\xff\xfe\n12\nnull\n" + whole + b'{"event": "st')
+    with RunLog(tmp_path, start=1, total=4):
+        assert read_metrics(tmp_path) == [{"event": "step", "step": 1}]
+    assert (tmp_path / "metrics.jsonl").read_bytes() == whole
+
+
 def test_progress_without_a_terminal_is_plain_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with RunLog(tmp_path, start=0, total=3) as log:
         for step in (1, 2, 3):
@@ -155,7 +166,21 @@ def test_progress_in_a_terminal_is_one_live_line(tmp_path: Path, monkeypatch: py
     with RunLog(tmp_path, start=1, total=3) as log:
         log.event("validation", 1, 0, VALIDATION)
         log.progress(2, metered(1.5))
+        log._began -= 40 * (3 - 1)  # slow steps
+        log.progress(2, metered(1.5))
+        assert log._progress is not None
+        log._progress.refresh()
+        log.say("WARNING: /data/[old]/run[/b] " + "x" * 120)
         log.progress(3, metered(1.25))
     text = out.getvalue()
+    assert "0:01:20 left" in text  # one step done, one to go
+    assert "WARNING: /data/[old]/run[/b] " + "x" * 120 in text  # neither markup nor broken lines
     assert "3/3" in text and "loss 1.2500" in text and "PCK 0.250" in text and "data wait 3%" in text
     assert "\x1b[" in text
+
+
+def test_a_run_that_never_leaves_its_warm_up_is_told() -> None:
+    facts = dict.fromkeys(("pairs", "objects", "batch_size", "steps_per_epoch", "left_out", "resumed_at"), 1)
+    facts |= {"parameters": 1, "precision": "fp32", "device": "cpu", "world": 1, "resumed_from": None, "left_out": 0}
+    assert "warm-up" in describe_start(facts | {"total_steps": 1000, "warmup_steps": 1000})
+    assert "warm-up" not in describe_start(facts | {"total_steps": 1001, "warmup_steps": 1000})

@@ -1,9 +1,13 @@
 """A run as a service: what it keeps, says, survives and refuses."""
 
 import json
+import math
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tiny_runs import losses_of, tiny
@@ -15,7 +19,7 @@ from dope.checkpoints import list_checkpoints, load_network
 from dope.common.errors import BadInput, DopeError, UsageError
 from dope.config import TrainConfig
 from dope.distributed import Ranks
-from dope.run_logging import read_metrics
+from dope.run_logging import SilentLog, read_metrics
 from dope.state import wrap
 from dope.trainer import train
 
@@ -149,6 +153,10 @@ def test_a_run_too_short_to_be_profiled_says_so(
 ) -> None:
     train(shards, tmp_path, tiny("validation.every=0"), profile=3, stop_after=1)
     assert "no trace was written" in capsys.readouterr().err and not (tmp_path / "profile").exists()
+    (tmp_path / "profile").mkdir()
+    (tmp_path / "profile/trace.json").write_text("of another call")
+    train(shards, tmp_path, tiny("validation.every=0"), profile=3, stop_after=1)
+    assert "no trace was written" in capsys.readouterr().err
 
 
 def test_a_loss_that_is_not_finite_stops_with_step_and_samples(
@@ -156,8 +164,8 @@ def test_a_loss_that_is_not_finite_stops_with_step_and_samples(
 ) -> None:
     real = trainer.sample_batch
 
-    def poisoned(batch: object, config: TrainConfig, step: int, share: Share) -> object:
-        sampled = real(batch, config, step, share)  # type: ignore[arg-type]
+    def poisoned(batch: Any, config: TrainConfig, step: int, share: Share) -> object:
+        sampled = real(batch, config, step, share)
         if step == 2:
             sampled.views.images1[0, 0, 0, 0] = float("nan")
         return sampled
@@ -165,13 +173,29 @@ def test_a_loss_that_is_not_finite_stops_with_step_and_samples(
     monkeypatch.setattr(trainer, "sample_batch", poisoned)
     with pytest.raises(DopeError, match=r"the loss is nan at step 2 .*object_00\d-000\d") as caught:
         train(shards, tmp_path, tiny("validation.every=0"))
-    assert "optimiser.lr" in str(caught.value) and "not_finite-2.json" in str(caught.value)
+    assert "into another --out with a lower --set optimiser.lr" in str(caught.value)
+    assert "not_finite-2.json" in str(caught.value)
     line = read_metrics(tmp_path, "not_finite")[0]
     assert line["step"] == 2 and len(line["keys"]) == 4
     written = json.loads((tmp_path / "not_finite-2.json").read_text())
     assert (written["not_finite"], written["values"]["loss"], written["epoch"]) == ("loss", "nan", 1)
     assert [sample["key"] for sample in written["samples"]] == line["keys"]
     assert all(sample["key"].startswith(sample["sequence"] + "-") for sample in written["samples"])
+
+
+def test_samples_in_place_of_damaged_ones_are_not_named(tmp_path: Path) -> None:
+    index = SimpleNamespace(objects=np.array([5]), sequences=np.array(["mug"]))
+    state = SimpleNamespace(step=1, place=SimpleNamespace(epoch=0))
+    run: Any = SimpleNamespace(state=state, dataset=SimpleNamespace(index=index), out=tmp_path)
+    run.ranks = SimpleNamespace(rank=0, is_first=True, collect=lambda mine: [mine])
+    damaged = {0: None, 1: None}
+    batch: Any = SimpleNamespace(keys=("", "a"), objects=torch.tensor([-1, 5]), damaged=damaged)
+    for keys in ([], ["a"]):
+        with pytest.raises(DopeError, match="the loss is nan"):
+            guard.require_finite(run, {"loss": math.nan, "grad_norm": 0.0}, batch, SilentLog())
+        samples = json.loads((tmp_path / "not_finite-1.json").read_text())["samples"]
+        assert [sample["key"] for sample in samples] == keys
+        damaged.pop(1, None)
 
 
 def test_a_gradient_that_is_not_finite_stops_before_it_reaches_the_weights(
