@@ -190,6 +190,13 @@ def test_a_damaged_file_is_read_or_refused_and_never_anything_else(tmp_path: Pat
     assert refused > 50
 
 
+def test_a_file_far_too_large_is_refused_unread(tmp_path: Path) -> None:
+    path = w.write(tmp_path / "x.obj", w.obj())
+    os.truncate(path, 300 << 20)  # of which the disk holds one block
+    with pytest.raises(BadInput, match=r"huge \(300 MiB"):
+        load_model(path, max_faces=1000)
+
+
 def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
     (tmp_path / "folder.obj").mkdir()
     for name in ("absent.obj", "folder.obj"):

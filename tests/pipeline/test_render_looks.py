@@ -134,6 +134,10 @@ def test_obj_counts_back_continues_lines_and_takes_colours(tmp_path: Path) -> No
     (part,) = load(tmp_path / "a.obj", "v 0 0 0 1 0 0\nv 1 0 0 \\\n 1 0 0\nv 0 1 0 1 0 0\nf -3 -2 -1\nv 9 9 9 0 0 0\n")
     assert part.colours is not None and np.allclose(part.colours, (1, 0, 0))
     assert sorted(part.vertices.tolist()) == [[0, 0, 0], [0, 1, 0], [1, 0, 0]]
+    seam = w.lines(SQUARE, "v ") + w.lines(SQUARE[:, :2], "vt ") + "f 1/1 2/2 3/3\nf 1/4 3/3 4/4\n"
+    (part,) = load(tmp_path / "s.obj", seam)
+    assert part.uv is not None
+    assert np.array_equal(part.uv[part.faces], SQUARE[[[0, 1, 2], [3, 2, 3]], :2]), "vertex 1 has two coordinates"
     mixed = w.lines(SQUARE, "\tv\t") + "vt 0 0\nf 1/1 2/1 3/1 # first\nf 1//  3 4\r\n"
     (part,) = load(tmp_path / "b.obj", mixed)
     assert len(part.faces) == 2 and part.uv is None, "texture coordinates of some corners only are none"
@@ -191,6 +195,19 @@ def test_gltf_nodes_place_turn_and_mirror(tmp_path: Path) -> None:
         corners = part.vertices[part.faces]
         away = corners.mean(axis=1) - (part.vertices.min(axis=0) + part.vertices.max(axis=0)) / 2
         assert (away * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])).sum(axis=1).min() > 0
+
+
+def test_gltf_normals_turn_with_their_surface(tmp_path: Path) -> None:
+    slope = np.array([[0, 0, 0], [1, 0, 1], [0, 1, 0]], dtype=np.float64)
+    value, data = w.gltf_json(slope, [[0, 1, 2]])
+    data = w.add_accessor(value, data, np.tile(np.array([-1, 0, 1], "<f4"), (3, 1)), "VEC3")
+    value["meshes"][0]["primitives"][0]["attributes"]["NORMAL"] = 2
+    for scale in ([1, 1, 5], [-1, 1, 5]):
+        value["nodes"][0] = {"mesh": 0, "rotation": [0.5, 0.5, 0.5, 0.5], "scale": scale}
+        (part,) = load(tmp_path / "x.glb", w.glb(value, data))
+        corners = part.vertices[part.faces[0]]
+        flat = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+        assert part.normals is not None and np.allclose(part.normals, flat / np.linalg.norm(flat)), scale
 
 
 def test_gltf_strips_fans_sparse_and_strided_accessors(tmp_path: Path) -> None:

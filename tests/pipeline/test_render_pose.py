@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from mesh_writers import BOX, TRIANGLES
 from numpy.typing import NDArray
 
+from dope.common.errors import DopeError
 from dope.common.seeds import generator
 from pipeline.render.load_checks import checked
 from pipeline.render.pose import posed, resting_sides
@@ -164,3 +166,9 @@ def test_a_pose_is_a_function_of_model_and_seed() -> None:
     assert first.vertices().tobytes() == again.vertices().tobytes()
     other = posed(model(), up="z", pose="stable", rng=generator(5))
     assert not np.allclose(first.vertices(), other.vertices())
+
+
+def test_without_scipy_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "scipy.spatial", None)
+    with pytest.raises(DopeError, match=r"pip install 'dope-descriptors\[render\]'"):
+        resting_sides(BOX)
