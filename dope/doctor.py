@@ -60,7 +60,9 @@ REQUIRED = (
 )
 
 OPTIONAL = (
-    ("Blender (bpy)", "bpy", "photoreal renders of meshes (planned)", "pip install '.[blender]' (Python 3.11 or 3.13)"),
+    ("moderngl", "moderngl", "dope prep render", "pip install 'dope-descriptors[render]', and libegl1, libgl1-mesa-dri"),
+    ("scipy", "scipy", "dope prep render", "pip install 'dope-descriptors[render]'"),
+    ("Blender (bpy)", "bpy", "dope prep render --renderer cycles", "into an environment of its own: see the README"),
     ("OpenEXR", "OpenEXR", "depth maps in EXR files", "pip install 'dope-descriptors[exr]'"),
     ("Weights & Biases", "wandb", "--set log.wandb=PROJECT of dope train", "pip install 'dope-descriptors[wandb]'"),
     ("s3fs", "s3fs", "shards in s3://", "pip install '.[s3]'"),

@@ -166,7 +166,7 @@ def render(
     """
     from pipeline.console import Display, exit_code, show_rows
     from pipeline.engines import find_share
-    from pipeline.inputs.sources import input_errors_as_rows, known_sources
+    from pipeline.inputs.sources import SourceError, input_errors_as_rows, known_sources
     from pipeline.refused import keep_refused
     from pipeline.render.config import RenderConfig
     from pipeline.render.find import find_meshes
@@ -190,7 +190,7 @@ def render(
     resolved: RenderConfig = resolve_config(RenderConfig, config, flags, set_)
     share = find_share(shard_index, num_shards)
     sources: list[ObjectSource]
-    errors = []
+    errors: list[SourceError] = []
     if resolved.recipe == "procedural":
         if meshes or count is None:
             raise UsageError("--recipe procedural makes its objects itself", remedy="Give --count N, and no MESHES")

@@ -246,7 +246,7 @@ def _renderer(config: RenderConfig) -> Renderer:
 
             _renderers[its] = FastRenderer(its)
         else:
-            from pipeline.render.cycles import CyclesRenderer
+            from pipeline.render.cycles.renderer import CyclesRenderer
 
             _renderers[its] = CyclesRenderer(its)
     return _renderers[its]
