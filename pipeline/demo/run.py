@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 from rich.console import Console
+from rich.markup import escape
 
 from dope.common import files
 from dope.common.errors import DopeError
@@ -32,9 +33,11 @@ class Plan:
     episodes: int
     ways: int
     queries: int
+    renders: int
+    """Procedural CAD-like objects to train on as well, rendered with exact depth instead of filmed."""
 
 
-FULL = Plan(DemoConfig(), train=(), episodes=1000, ways=4, queries=2)
+FULL = Plan(DemoConfig(), train=(), episodes=1000, ways=4, queries=2, renders=12)
 TINY = Plan(
     DemoConfig(
         per_family=2,
@@ -46,6 +49,7 @@ TINY = Plan(
     episodes=20,
     ways=2,
     queries=1,
+    renders=2,
 )
 
 
@@ -91,8 +95,16 @@ def run_demo(out: Path, *, workers: int = 0, tiny: bool = False) -> None:
              *base, *("--set", f"frames.count={plan.films.film.frames}"), allow_failed_items=True)  # fmt: skip
         dope("prep", "masks", work, *base, allow_failed_items=True)
         dope("prep", "correspond", work, "--every", 1, *base, allow_failed_items=True)
-        holdout = ("--holdout", "frames") if part == "train" else ("--holdout", "none")
-        dope("prep", "shards", work, "--out", out / f"shards-{part}", *holdout, allow_failed_items=True)
+        works, holdout = [work], ("--holdout", "none")
+        if part == "train":
+            holdout = ("--holdout", "frames")
+            if (reason := _cannot_render()) is None:
+                works.append(out / "work-renders")
+                dope("prep", "render", "--recipe", "procedural", "--count", plan.renders, "--out", works[1], *base)
+                dope("prep", "correspond", works[1], *base, allow_failed_items=True)
+            else:
+                say(f"[yellow]no renders of procedural objects: {escape(reason)}[/]")
+        dope("prep", "shards", *works, "--out", out / f"shards-{part}", *holdout, allow_failed_items=True)
 
     run, shards, novel = out / "run", out / "shards-train", out / "shards-novel"
     settings = [word for setting in plan.train for word in ("--set", setting)]
@@ -104,6 +116,17 @@ def run_demo(out: Path, *, workers: int = 0, tiny: bool = False) -> None:
         for kind in ("colouring", "heatmap"):
             dope("figure", run, dataset, "--kind", kind, *shown, "--masks", "given", "--out", out / "figures")
     _summary(console, out, time.monotonic() - start)
+
+
+def _cannot_render() -> str | None:
+    """Why nothing can be rendered on this machine, or None."""
+    try:
+        from pipeline.render.fast.context import context
+
+        context()
+    except DopeError as error:
+        return str(error)
+    return None
 
 
 def _run(command: list[str]) -> int:
@@ -148,7 +171,9 @@ def _summary(console: Console, out: Path, seconds: float) -> None:
         (out / "figures", "the same colours on the same parts; a similarity heat map"),
         (out / "videos", "the videos that were made"),
         (out / "work-train", "a COLMAP project for each video, with depth and masks"),
+        (out / "work-renders", "procedural objects, rendered: pairs of views with exact masks and depth"),
         (out / "shards-train", "the training shards and their index"),
         (out / "run", "checkpoints, metrics.jsonl, TensorBoard logs, scores"),
     ):
-        console.print(f"  [bold]{path}[/]  {what}", soft_wrap=True)
+        if path.exists():
+            console.print(f"  [bold]{path}[/]  {what}", soft_wrap=True)
