@@ -240,6 +240,9 @@ def test_normals_of_the_file_make_it_smooth(blender: CyclesRenderer) -> None:
     assert all(np.ptp(profile) > 30 for profile in profiles)
     steps = [np.abs(np.diff(profile)).max() for profile in profiles]
     assert steps[1] < 0.5 * steps[0]
+    inside_out = dataclasses.replace(coarse, faces=coarse.faces[:, ::-1])
+    again = render_one(blender, small_scene(camera, part=inside_out, light=Light(sky)))
+    assert np.abs(again.image.astype(float) - smooth).mean() < 2
 
 
 def test_what_lies_flat_on_the_ground_is_seen(blender: CyclesRenderer) -> None:
