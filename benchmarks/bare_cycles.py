@@ -1,7 +1,7 @@
 """Render calls and nothing else, in Blender's interpreter: what benchmarks/render_cycles.py compares with.
 
 Takes the messages of pipeline/render/cycles on stdin. Answers each shot with the CPU seconds of
-`bpy.ops.render.render()` alone, which writes and reads nothing: the scene was built, and the camera placed, outside that time.
+`bpy.ops.render.render()` alone, which writes and reads nothing: scene and camera were made outside that time.
 """
 
 import json

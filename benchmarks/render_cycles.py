@@ -27,6 +27,7 @@ from pipeline.geometry import Camera
 from pipeline.render.config import CyclesConfig
 from pipeline.render.cycles import process, renderer
 from pipeline.render.cycles.exchange import scene_message, shot_message
+from pipeline.render.cycles.exposure import expose
 from pipeline.render.cycles.folders import PrivateFolder
 from pipeline.render.cycles.renderer import CyclesRenderer
 from pipeline.render.scene import Ground, Light, Model, Part, Scene, Shot, Surface
@@ -97,7 +98,10 @@ def measure_cost(config: CyclesConfig, objects: int, views: int, size: int) -> N
     for number in range(objects):
         one = scene(number, views, size)
         deadline = time.monotonic() + 3600
-        bare.ask(scene_message(one, config, limits.threads, folder.path / "scene.npz"), deadline)
+        bare.ask(
+            scene_message(one, expose(one.light, one.ground), config, limits.threads, folder.path / "scene.npz"),
+            deadline,
+        )
         spent, spent_bare = 0.0, 0.0
         pictures = blender.render(one)
         for shot in one.shots:  # a view of each in turn: what else the machine does slows both
