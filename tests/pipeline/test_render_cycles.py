@@ -12,6 +12,7 @@ import pytest
 from pipeline.children import Limits
 from pipeline.geometry import Camera
 from pipeline.render.config import CyclesConfig
+from pipeline.render.cycles.exposure import to_linear, to_srgb
 from pipeline.render.cycles.process import VARIABLE
 from pipeline.render.cycles.renderer import CyclesRenderer
 from pipeline.render.scene import Light, Model, Part, Picture, Scene, Shot, Surface
@@ -114,14 +115,14 @@ def unproject(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarr
 @pytest.mark.parametrize(("azimuth", "elevation", "turn"), [(0.0, 0.1, 0.0), (0.7, 0.2, 0.0), (0.7, 0.2, 1.1)])
 def test_the_panorama_is_where_it_says(blender: CyclesRenderer, azimuth: float, elevation: float, turn: float) -> None:
     """Row 0 is up, the middle column +x, columns clockwise from above; `turn` is counter-clockwise."""
-    sky = np.full((64, 128, 3), 0.02, np.float32)
+    sky = np.repeat(np.array([0.5, 0.02, 0.5], np.float32)[None], 64 * 128, axis=0).reshape(64, 128, 3)
     row, column = int((0.5 - elevation / np.pi) * 64), int((0.5 - azimuth / (2 * np.pi)) * 128)
     sky[row, column] = (0.1, 2.0, 0.1)
     where = np.pi / 2 - (row + 0.5) / 64 * np.pi, np.pi - (column + 0.5) / 128 * 2 * np.pi + turn
     towards = np.array([np.cos(where[0]) * np.cos(where[1]), np.cos(where[0]) * np.sin(where[1]), np.sin(where[0])])
     camera = look_at(azimuth + turn + np.pi + 0.2, 1.5, 2.0)  # from the other side
     picture = render_one(blender, small_scene(camera, part=box((0.01, 0.01, 0.01)), light=Light(sky, 1.0)))
-    assert turn == 0 or picture.image[..., 1].max() < 100  # not where it was before the turn
+    assert turn == 0 or picture.image[..., 1].max() < 200  # not where it was before the turn
     picture = render_one(blender, small_scene(camera, part=box((0.01, 0.01, 0.01)), light=Light(sky, 1.0, turn)))
     ys, xs = np.nonzero(picture.image[..., 1] > 200)
     spot = np.array([xs.mean() + 0.5, ys.mean() + 0.5])
@@ -165,10 +166,11 @@ def test_textures_lie_as_their_coordinates_say(blender: CyclesRenderer) -> None:
 
 
 def test_brightness_is_that_of_albedo_under_even_light(blender: CyclesRenderer) -> None:
-    """A matt surface of albedo a under light 1 from all around is as bright as a; gloss adds a little."""
+    """A matt surface of albedo a under light 0.6 from all around is as bright as 0.6 a; gloss adds a little."""
     for colour in (0.3, 0.7):
-        picture = render_one(blender, facing(card(colour=(colour,) * 3), light=even_light(1.0)))
-        assert abs(int(picture.image[32, 32, 1]) - colour * 255) < 25
+        picture = render_one(blender, facing(card(colour=(colour,) * 3)))
+        expected = to_srgb(0.6 * to_linear(np.array(colour)))
+        assert -5 < int(picture.image[32, 32, 1]) - int(expected) < 25
     bright = render_one(blender, facing(card(), light=even_light(1.0)))
     grey = render_one(blender, facing(card(colour=(0.6, 0.6, 0.6)), light=even_light(1.0)))
     np.testing.assert_array_equal(bright.image, grey.image)  # no look: grey
@@ -240,6 +242,9 @@ def test_normals_of_the_file_make_it_smooth(blender: CyclesRenderer) -> None:
     assert all(np.ptp(profile) > 30 for profile in profiles)
     steps = [np.abs(np.diff(profile)).max() for profile in profiles]
     assert steps[1] < 0.5 * steps[0]
+    inside_out = dataclasses.replace(coarse, faces=coarse.faces[:, ::-1])
+    again = render_one(blender, small_scene(camera, part=inside_out, light=Light(sky)))
+    assert np.abs(again.image.astype(float) - smooth).mean() < 2
 
 
 def test_what_lies_flat_on_the_ground_is_seen(blender: CyclesRenderer) -> None:

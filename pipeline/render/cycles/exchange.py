@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from dope.common.errors import BadInput
 from pipeline.render.config import CyclesConfig
+from pipeline.render.cycles.exposure import Exposure, show
 from pipeline.render.cycles.exr import read_exr
 from pipeline.render.scene import Picture, Scene, Shot
 
@@ -17,7 +18,7 @@ _SKY = 1e9
 """Blender writes 1e10 where nothing is."""
 
 
-def scene_message(scene: Scene, config: CyclesConfig, threads: int, file: Path) -> dict[str, Any]:
+def scene_message(scene: Scene, exposure: Exposure, config: CyclesConfig, threads: int, file: Path) -> dict[str, Any]:
     """Write the arrays of a scene into `file` (.npz) and return the message that goes with it.
 
     Raises:
@@ -63,7 +64,7 @@ def scene_message(scene: Scene, config: CyclesConfig, threads: int, file: Path) 
             "seed": int(surface.seed),
         },
         "ground": ground,
-        "light": {"strength": float(scene.light.strength), "turn": float(scene.light.turn)},
+        "light": {"strength": exposure.strength, "turn": float(scene.light.turn)},
         "cycles": {
             "samples": config.samples,
             "denoise": config.denoise,
@@ -95,8 +96,8 @@ def shot_message(shot: Shot, file: Path) -> dict[str, Any]:
     }
 
 
-def read_picture(file: Path, shot: Shot) -> Picture:
-    """The picture in an EXR file of Blender's: colours through sRGB's curve ("Standard"), mask by object index.
+def read_picture(file: Path, shot: Shot, exposure: Exposure) -> Picture:
+    """The picture in an EXR file of Blender's: colours as a camera shows them, mask by object index.
 
     Depth and index are those of the first sample, which Cycles sends through the pixel's centre.
 
@@ -112,13 +113,6 @@ def read_picture(file: Path, shot: Shot) -> Picture:
         raise ValueError(f"lacks a pass; it has {sorted(passes)}") from None
     if depth.shape != (shot.camera.height, shot.camera.width):
         raise ValueError(f"is {depth.shape[1]}x{depth.shape[0]}")
-    image = to_srgb(np.stack([red, green, blue], axis=-1))
+    image = show(np.stack([red, green, blue], axis=-1), exposure.balance)
     mask = index == 1
     return Picture(image, mask, np.where(depth < _SKY, depth, np.float32(0)))
-
-
-def to_srgb(linear: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Linear light to sRGB bytes (IEC 61966-2-1), cut at 1; what is not finite is black."""
-    light = np.clip(np.nan_to_num(linear, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0)
-    srgb = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.power(light, np.float32(1 / 2.4)) - 0.055)
-    return np.round(srgb * 255).astype(np.uint8)

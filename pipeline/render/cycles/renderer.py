@@ -12,6 +12,7 @@ from pipeline.children import Limits
 from pipeline.render.config import CyclesConfig
 from pipeline.render.cycles import process
 from pipeline.render.cycles.exchange import read_picture, scene_message, shot_message
+from pipeline.render.cycles.exposure import expose
 from pipeline.render.cycles.folders import PrivateFolder
 from pipeline.render.scene import Picture, Scene
 
@@ -56,7 +57,8 @@ class CyclesRenderer:
             DopeError: Blender could not be started.
         """
         folder = self._folder.path
-        message = scene_message(scene, self._config, self._limits.threads, folder / "scene.npz")
+        exposure = expose(scene.light, scene.ground)
+        message = scene_message(scene, exposure, self._config, self._limits.threads, folder / "scene.npz")
         requests = [shot_message(shot, folder / "shot.exr") for shot in scene.shots]
         blender = self._ready()
         self._objects += 1
@@ -68,7 +70,7 @@ class CyclesRenderer:
                 raise RuntimeError("another scene was begun before this one was done")
             left = self._ask(blender, request, left)
             try:
-                picture = read_picture(folder / "shot.exr", shot)
+                picture = read_picture(folder / "shot.exr", shot, exposure)
             except (OSError, ValueError) as error:
                 self._end()
                 raise BadInput(f"Blender's picture cannot be read: {error}") from None

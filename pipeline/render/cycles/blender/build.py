@@ -87,8 +87,18 @@ def part_mesh(name: str, arrays: dict[str, Any]) -> Any:
     mesh.polygons.foreach_set("use_smooth", np.full(len(faces), smooth))
     mesh.update(calc_edges=True)
     if smooth:
-        mesh.normals_split_custom_set_from_vertices(arrays["normals"].astype(np.float32))
+        mesh.normals_split_custom_set(corner_normals(arrays["vertices"], faces, arrays["normals"]))
     return mesh
+
+
+def corner_normals(vertices: Any, faces: Any, normals: Any) -> Any:
+    """(3F, 3) normals of the faces' corners, on the side that the face itself turns outwards: against it a surface
+    would be black."""
+    corners = vertices[faces]
+    outwards = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    own = normals[faces]
+    inwards = np.einsum("fci,fi->fc", own, outwards) < 0
+    return np.where(inwards[..., None], -own, own).reshape(-1, 3).astype(np.float32)
 
 
 def ground_mesh(height: float) -> Any:
