@@ -10,7 +10,7 @@ uniform int encode;             // 1: sRGB, 0: linear light of a display
 uniform sampler2D panorama;
 uniform float panorama_rows;
 uniform float turn;
-uniform float exposure;
+uniform vec3 exposure;         // and white balance
 uniform int has_ground;
 uniform float height;
 uniform vec3 bounce;
@@ -27,12 +27,10 @@ vec3 to_srgb(vec3 c) {
     return mix(1.055 * pow(max(c, 1e-6), vec3(1.0 / 2.4)) - 0.055, c * 12.92, lessThanEqual(c, vec3(0.0031308)));
 }
 
-// Khronos PBR Neutral: colours below 0.8 stay true, what is brighter is compressed and loses its hue.
+// As Khronos PBR Neutral above its toe: colours below START stay true, brighter ones are compressed and lose their hue.
 vec3 tone_mapped(vec3 c) {
-    const float START = 0.8 - 0.04, FADE = 0.15;
+    const float START = 0.72, FADE = 0.15;
     c *= exposure;
-    float low = min(c.r, min(c.g, c.b));
-    c -= low < 0.08 ? low - 6.25 * low * low : 0.04;
     float peak = max(c.r, max(c.g, c.b));
     float d = 1.0 - START;
     float squeezed = 1.0 - d * d / (max(peak, START) + d - START);

@@ -39,7 +39,7 @@ void main() {
     mirrored.z = abs(mirrored.z);
     float share = reflected_share(ground_roughness, clamp(dot(n, view), 0.0, 1.0));
     vec3 glossy = sky(mirrored, highlight_level(ground_roughness));
-    vec3 radiance = base * diffuse + glossy * (share * open.r * open.g);
+    vec3 radiance = base * diffuse + glossy * (share * open.r);
     // Far away it goes over into the panorama, as in haze
     float far = smoothstep(10.0, 60.0, length(at - eye.xy));
     radiance = mix(radiance, sky(normalize(ray), 2.0), far);

@@ -31,8 +31,9 @@ KEY_RADIUS_DEG = (1.5, 16.0)
 """Smallest and largest radius of a key light: the sun's own is less than a shadow map resolves."""
 KEY_REACH_DEG = 24.0
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-GREY_CARD = 0.62
-"""Radiance that a white surface gets at strength 0.65, before tone mapping."""
+WHITE = 0.55
+"""Radiance that a white surface gets at strength 0.65 before tone mapping."""
+USUAL_ALBEDO = 0.25
 USUAL_STRENGTH = 0.65
 
 
@@ -47,7 +48,7 @@ class Lights:
         directions: (DIRECTIONS, 3) unit: KEY_SAMPLES for each key light, then AMBIENT_SAMPLES.
         weights: (DIRECTIONS,) share of its key light, or power of the smooth light around it; 0: unused.
         bounce: (3,) radiance of the lit ground, 0 without one.
-        exposure: multiplies radiance before tone mapping.
+        exposure: (3,) multiplies radiance before tone mapping; with it the white balance.
     """
 
     harmonics: Floats
@@ -56,7 +57,7 @@ class Lights:
     directions: Floats
     weights: Floats
     bounce: Floats
-    exposure: float
+    exposure: Floats
 
 
 def basis(directions: Floats) -> Floats:
@@ -82,18 +83,18 @@ def lights_of(light: Light, ground: Ground | None) -> Lights:
         if found is None:
             break
         keys[number], key_directions[number], radii[number] = found
-    bounce = np.zeros(3)
+    bounce, reflects = np.zeros(3), USUAL_ALBEDO
     if ground is not None:
         up = (radiance * angle[..., None] * np.maximum(toward[..., 2:], 0)).sum(axis=(0, 1)) / np.pi
         up += (keys * np.maximum(key_directions[:, 2:], 0)).sum(axis=0)
-        bounce = up * linear(cv2.resize(ground.albedo, (1, 1), interpolation=cv2.INTER_AREA)[0, 0] / 255.0)
+        albedo = linear(cv2.resize(ground.albedo, (1, 1), interpolation=cv2.INTER_AREA)[0, 0] / 255.0)
+        bounce, reflects = up * albedo, float(albedo @ LUMINANCE)
         radiance[toward[..., 2] <= 0] = bounce
     power = (radiance * angle[..., None]).reshape(-1, 3)
     harmonics = (_COSINE * _NORM * _NORM / np.pi)[:, None] * (basis(toward).reshape(-1, 9).T @ power)
     samples, weights = _samples(key_directions, radii, toward.reshape(-1, 3), power @ LUMINANCE)
     weights[: KEYS * KEY_SAMPLES] *= np.repeat(keys.any(axis=1), KEY_SAMPLES)
-    white = _white(harmonics, keys, key_directions)
-    exposure = GREY_CARD * light.strength / USUAL_STRENGTH / max(white, 1e-6)
+    exposure = _exposure(_white(harmonics, keys, key_directions), reflects) * (light.strength / USUAL_STRENGTH)
     return Lights(harmonics, keys, key_directions, samples, weights, bounce, exposure)
 
 
@@ -154,8 +155,15 @@ def frame_of(directions: Floats) -> tuple[Floats, Floats]:
     return across, np.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=-1)
 
 
-def _white(harmonics: Floats, keys: Floats, key_directions: Floats) -> float:
-    """Mean luminance of a white object: of surfaces that look up and to all sides."""
+def _white(harmonics: Floats, keys: Floats, key_directions: Floats) -> Floats:
+    """Mean radiance (3,) of a white object: of surfaces that look up and to all sides."""
     normals = np.array([[0, 0, 1.0], [0, 0, 1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
     light = basis(normals) @ harmonics + np.maximum(normals @ key_directions.T, 0) @ keys
-    return float((np.maximum(light, 0) @ LUMINANCE).mean())
+    return np.asarray(np.maximum(light, 1e-6).mean(axis=0))
+
+
+def _exposure(white: Floats, albedo: float) -> Floats:
+    """What a camera would set: WHITE for a white object, less over a bright ground, and half of the light's hue gone."""
+    bright = float(white @ LUMINANCE)
+    scale = WHITE / bright * np.clip(USUAL_ALBEDO / max(albedo, 1e-3), 0.2, 5) ** 0.35
+    return np.asarray(scale * (bright / white) ** 0.6)
