@@ -17,8 +17,8 @@ from pipeline.render import grounds, skies
 from pipeline.render.config import LookConfig, RenderConfig
 from pipeline.render.scene import Ground, Light, Model, Scene, Shot, Surface
 
-HDRIS, MATERIALS = 46, 25
-"""How many panoramas and materials there are where no folder is given; the paper has as many."""
+STUDIO = 19
+"""The procedural panorama that lights recipe plain: three soft boxes."""
 GREY = (0.62, 0.62, 0.62)
 Colour = tuple[float, float, float]
 T = TypeVar("T")
@@ -54,7 +54,7 @@ def draw_scene(model: Model, cameras: Sequence[Camera], config: RenderConfig, na
     defaults = RECIPES[config.recipe]
     kind = defaults.surface if look.surface == "recipe" else look.surface
     surface = draw_surface(kind, model, rng)
-    light = draw_light(look, rng) if config.recipe != "plain" or look.hdris else Light(skies.studio(), 0.65)
+    light = draw_light(look, rng) if config.recipe != "plain" or look.hdris else Light(skies.sky(STUDIO))
     has_ground = defaults.ground if look.ground == "recipe" else look.ground == "on"
     ground = draw_ground(look, float(model.vertices()[:, 2].min()), rng) if has_ground else None
     places = rng.uniform(-look.places, look.places, (len(cameras) // 2 + 1, 2))
@@ -87,16 +87,16 @@ def _colour(rng: np.random.Generator, hue: float | None = None) -> Colour:
 
 def draw_light(look: LookConfig, rng: np.random.Generator) -> Light:
     """One of the panoramas, its strength and direction."""
-    panorama = _choice(look.hdris, skies.find_skies, skies.read_sky, skies.sky, HDRIS, rng)
+    panorama = _choice(look.hdris, skies.find_skies, skies.read_sky, skies.sky, skies.COUNT, rng)
     return Light(panorama, float(rng.uniform(*look.strength)), float(rng.uniform(0, 2 * np.pi)))
 
 
 def draw_ground(look: LookConfig, height: float, rng: np.random.Generator) -> Ground:
     """One of the materials, on a plane at `height`."""
     material = _choice(
-        look.materials, grounds.find_materials, grounds.read_material, grounds.ground_material, MATERIALS, rng
+        look.materials, grounds.find_materials, grounds.read_material, grounds.ground_material, grounds.COUNT, rng
     )
-    return Ground(height, material.albedo, material.bumps, material.roughness, material.side)
+    return material.at(height)
 
 
 def _choice(
