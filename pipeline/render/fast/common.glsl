@@ -69,3 +69,10 @@ float reflected_share(float rough, float n_v) {
     vec2 ab = vec2(-1.04, 1.04) * a + r.zw;
     return 0.04 * ab.x + ab.y;
 }
+
+// How much of a mirror image is left where key lights are hidden: what shows the light itself goes with it.
+float unhidden(vec3 mirrored, vec2 open) {
+    float first = smoothstep(0.6, 0.95, dot(mirrored, key_directions[0]));
+    float second = smoothstep(0.6, 0.95, dot(mirrored, key_directions[1]));
+    return mix(1.0, open.x, first) * mix(1.0, open.y, second);
+}

@@ -44,10 +44,10 @@ _stock: dict[tuple[object, ...], list[moderngl.Texture]] = {}
 
 
 def take_texture(width: int, height: int, components: int, dtype: np.dtype[Any]) -> moderngl.Texture:
-    """A texture with room for all mip levels, trilinear and repeating, for uint8 or float16. Its content is left over."""
+    """A texture with room for all mip levels, trilinear and repeating, for uint8 or float32. Its content is left over."""
     import moderngl
 
-    key = (os.getpid(), width, height, components, {"u": "f1", "f": "f2"}[dtype.kind])
+    key = (os.getpid(), width, height, components, {"u": "f1", "f": "f4"}[dtype.kind])
     if _stock.get(key):
         made = _stock[key].pop()
     else:

@@ -14,8 +14,8 @@ from pipeline.render.scene import Model, Part
 GREY = 0.6  # sRGB, of parts that say nothing of how they look
 MAX_TEXELS = 1 << 25  # of all textures of a model together
 MAX_SIDE = 2048
-OCCLUDER_FACES = 60_000
-OCCLUDER_CELLS = 192
+OCCLUDER_FACES = 1500
+OCCLUDER_CELLS = (128, 64, 48)
 
 
 @dataclass(frozen=True)
@@ -74,18 +74,37 @@ def geometry_of(model: Model) -> Geometry:
 
 
 def occluder_faces(geometry: Geometry) -> NDArray[np.uint32]:
-    """Faces (F', 3) that cast shadows: all, or of a large mesh those that a grid of 1/192 of its box tells apart."""
+    """Faces (F', 3) that cast shadows: all of a small mesh, of others about what a shadow map tells apart.
+
+    Vertices of a cell of a grid become one of them, which leaves no gaps. Faces that become lines by that, and lie at
+    no other face, are thin rods: two for each line stay as they are.
+    """
     faces = geometry.faces[:, :3]
-    if len(faces) <= OCCLUDER_FACES:
-        return faces
+    for cells in OCCLUDER_CELLS:
+        if len(faces) <= OCCLUDER_FACES:
+            return faces
+        faces = _clustered(geometry, cells)
+    return faces
+
+
+def _clustered(geometry: Geometry, cells: int) -> NDArray[np.uint32]:
+    faces = geometry.faces[:, :3]
     size = max(float((geometry.high - geometry.low).max()), 1e-12)
-    cells = ((geometry.vertices[:, :3] - geometry.low) * (OCCLUDER_CELLS / size)).astype(np.int64)
-    names = cells @ np.array([1, 256, 65536])
-    corners = np.sort(names[faces], axis=1)
-    keep = (corners[:, 0] != corners[:, 1]) | (corners[:, 1] != corners[:, 2])  # slivers of two cells still cover
-    keys = (corners * np.array([1, 0x9E3779B97F4A7C1, 0xC2B2AE3D27D4EB])).sum(axis=1)  # wraps around: a hash
-    _, first = np.unique(keys[keep], return_index=True)
-    return np.asarray(faces[keep][np.sort(first)])
+    place = ((geometry.vertices[:, :3] - geometry.low.astype(np.float32)) * np.float32(cells / size)).astype(np.int64)
+    _, first, cell = np.unique(place @ np.array([1, 1 << 10, 1 << 20]), return_index=True, return_inverse=True)
+    corners = np.sort(cell.reshape(-1).astype(np.int64)[faces], axis=1)
+    names = (corners[:, 0] * len(first) + corners[:, 1]) * len(first) + corners[:, 2]
+    distinct = (corners[:, 0] != corners[:, 1]).astype(np.int8) + (corners[:, 1] != corners[:, 2])
+    _, solid = np.unique(np.where(distinct == 2, names, -1), return_index=True)
+    solid = solid[distinct[solid] == 2]
+    lines = np.flatnonzero(distinct == 1)
+    ends = corners[lines, 0] * len(first) + corners[lines, 2]
+    edges = [corners[solid][:, a] * len(first) + corners[solid][:, b] for a, b in ((0, 1), (1, 2), (0, 2))]
+    bare = ~np.isin(ends, np.concatenate(edges))  # the others lie at a face that is kept
+    lines, ends = lines[bare], ends[bare]
+    kept = [np.unique(order, return_index=True)[1] for order in (ends, ends[::-1])]
+    both = np.unique(np.concatenate([lines[kept[0]], lines[::-1][kept[1]]]))
+    return np.concatenate([first[corners[np.sort(solid)]].astype(np.uint32), faces[both]])
 
 
 def linear(srgb: NDArray[np.floating]) -> NDArray[np.floating]:

@@ -29,7 +29,10 @@ void main() {
     if (has_bumps == 1) n = normalize(vec3(-textureGrad(slopes, g, right, down).rg, 1.0));
     vec2 spot = at / reach;
     float rim = max(abs(spot.x), abs(spot.y));
-    vec3 open = 1.0 - textureLod(blocked, 0.5 + 0.5 * spot, 0.0).rgb * (1.0 - smoothstep(0.8, 1.0, rim));
+    spot = 0.5 + 0.5 * spot;
+    // The few directions that stand for the whole sky must not show one by one
+    vec3 kept = vec3(textureLod(blocked, spot, 2.0).r, textureLod(blocked, spot, 0.0).gb);
+    vec3 open = 1.0 - kept * (1.0 - smoothstep(0.8, 1.0, rim));
     vec3 diffuse = smooth_light(n) * open.r;
     diffuse += keys[0] * (max(dot(n, key_directions[0]), 0.0) * open.g);
     diffuse += keys[1] * (max(dot(n, key_directions[1]), 0.0) * open.b);
@@ -39,7 +42,7 @@ void main() {
     mirrored.z = abs(mirrored.z);
     float share = reflected_share(ground_roughness, clamp(dot(n, view), 0.0, 1.0));
     vec3 glossy = sky(mirrored, highlight_level(ground_roughness));
-    vec3 radiance = base * diffuse + glossy * (share * open.r);
+    vec3 radiance = base * diffuse + glossy * (share * open.r * unhidden(mirrored, open.gb));
     // Far away it goes over into the panorama, as in haze
     float far = smoothstep(10.0, 60.0, length(at - eye.xy));
     radiance = mix(radiance, sky(normalize(ray), 2.0), far);

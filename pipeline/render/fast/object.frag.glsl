@@ -106,11 +106,13 @@ void main() {
     // Looked up a little above the surface, else it would shade itself
     vec4 p = vec4(hit.point + hit.normal * (1.6 * shadow_step), 1.0);
     vec3 diffuse = vec3(0.0);
+    vec2 lit_by = vec2(1.0);
     for (int k = 0; k < n_keys; k++) {
         float facing = max(min(dot(n, key_directions[k]), 4.0 * dot(hit.normal, key_directions[k])), 0.0);
         float light = 0.0;
         for (int i = k * KEY_SAMPLES; i < (k + 1) * KEY_SAMPLES; i++) light += lit(i, p);
-        diffuse += keys[k] * (facing * light / float(KEY_SAMPLES));
+        lit_by[k] = light / float(KEY_SAMPLES);
+        diffuse += keys[k] * (facing * lit_by[k]);
     }
     float whole = 1e-9, open = 1e-9;
     for (int i = KEYS * KEY_SAMPLES; i < DIRECTIONS; i++) {
@@ -125,7 +127,7 @@ void main() {
     float level = highlight_level(roughness), soft = 0.02 + 0.06 * level;
     float up = has_ground == 1 ? smoothstep(-soft, soft, outward.z) : 1.0;
     vec3 mirrored = mix(bounce, surroundings(outward, level), up);
-    float share = reflected_share(roughness, clamp(dot(n, view), 0.0, 1.0)) * openness;
+    float share = reflected_share(roughness, clamp(dot(n, view), 0.0, 1.0)) * openness * unhidden(outward, lit_by);
     out_colour = vec4(shown(base_colour(hit) * diffuse + mirrored * share), 1.0);
     out_depth = hit.z;
 }

@@ -198,6 +198,8 @@ class SceneOnDevice:
         ctx.blend_func = moderngl.ONE, moderngl.ONE
         if len(used):
             mesh.render(moderngl.TRIANGLES, instances=len(used))
+        texture.build_mipmaps(0, 2)
+        texture.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
         return texture
 
     # ---- textures and buffers
@@ -212,35 +214,32 @@ class SceneOnDevice:
 
     def _albedo(self, picture: NDArray[np.uint8]) -> Any:
         """Square roots of linear light in 8 bits: as fine as sRGB, and cheap to undo after the filter."""
-        light = cv2.LUT(np.ascontiguousarray(picture), _LINEAR)
-        levels = [light]
-        while max(levels[-1].shape[:2]) > 1:
-            levels.append(_halved(levels[-1], np.uint16))
-        rgba = [np.full((*level.shape[:2], 4), 255, np.uint8) for level in levels]
-        for out, level in zip(rgba, levels, strict=True):
-            out[..., :3] = _ROOTS[level >> 4]
-        return self._levels(rgba)
+        picture = np.ascontiguousarray(picture)
+        levels = [cv2.LUT(picture, _ROOTS_OF_SRGB)]
+        light = cv2.LUT(picture, _LINEAR)
+        while max(light.shape[:2]) > 1:
+            light = _halved(light)
+            levels.append(np.take(_ROOTS, light >> 4))
+        return self._levels([cv2.cvtColor(level, cv2.COLOR_RGB2RGBA) for level in levels])
 
     def _slopes(self, ground: Ground) -> Any:
         assert ground.bumps is not None
         levels = [slopes_of(ground.bumps, ground.side)]
         while max(levels[-1].shape[:2]) > 1:
-            levels.append(_halved(levels[-1], np.float32))
-        return self._levels([level.astype(np.float16) for level in levels])
+            levels.append(_halved(levels[-1]))
+        return self._levels(levels)
 
     def _panorama(self, panorama: NDArray[np.float32]) -> Any:
         """With levels that are blurred before they are halved, so that wide highlights have no corners."""
-        height, width = panorama.shape[:2]
-        level = np.ones((height, width, 4), np.float32)
-        level[..., :3] = np.minimum(panorama, 6e4)
+        level = cv2.cvtColor(np.ascontiguousarray(panorama), cv2.COLOR_RGB2RGBA)
         levels = [level]
         while max(level.shape[:2]) > 1:
             if min(level.shape[:2]) >= 4:
                 wide = cv2.copyMakeBorder(level, 0, 0, 2, 2, cv2.BORDER_WRAP)
                 level = cv2.GaussianBlur(wide, (5, 5), 0.9, borderType=cv2.BORDER_REPLICATE)[:, 2:-2]
-            level = _halved(level, np.float32)
+            level = _halved(level)
             levels.append(level)
-        made = self._levels([level.astype(np.float16) for level in levels])
+        made = self._levels(levels)
         made.repeat_y = False
         return made
 
@@ -276,11 +275,11 @@ def set_value(target: Any, key: str, value: Any) -> None:
 
 
 def slopes_of(bumps: NDArray[np.float32], side: float) -> NDArray[np.float32]:
-    """(S, S, 2) derivatives of heights along the ground's x and y; rows go against y."""
-    step_x, step_y = side / bumps.shape[1], side / bumps.shape[0]
-    x = (np.roll(bumps, -1, axis=1) - np.roll(bumps, 1, axis=1)) / (2 * step_x)
-    y = (np.roll(bumps, 1, axis=0) - np.roll(bumps, -1, axis=0)) / (2 * step_y)
-    return np.stack([x, y], axis=-1).astype(np.float32)
+    """(S, S', 2) derivatives of heights along the ground's x and y; rows go against y."""
+    wide = cv2.copyMakeBorder(bumps, 1, 1, 1, 1, cv2.BORDER_WRAP)
+    x = (wide[1:-1, 2:] - wide[1:-1, :-2]) * np.float32(bumps.shape[1] / (2 * side))
+    y = (wide[:-2, 1:-1] - wide[2:, 1:-1]) * np.float32(bumps.shape[0] / (2 * side))
+    return cv2.merge([x, y])
 
 
 def shadow_reach(directions: Floats, geometry: Geometry, height: float) -> float:
@@ -302,9 +301,9 @@ def _casters(lights: Lights) -> NDArray[np.bool_]:
     return (lights.directions[:, 2] > LOWEST_CASTER) & (lights.weights > 0)
 
 
-def _halved(level: NDArray[Any], dtype: type) -> NDArray[Any]:
+def _halved(level: NDArray[Any]) -> NDArray[Any]:
     height, width = max(1, level.shape[0] // 2), max(1, level.shape[1] // 2)
-    return cv2.resize(level, (width, height), interpolation=cv2.INTER_AREA).astype(dtype, copy=False)
+    return np.asarray(cv2.resize(level, (width, height), interpolation=cv2.INTER_AREA))
 
 
 def _padded(numbers: NDArray[np.intp]) -> NDArray[np.int32]:
@@ -314,4 +313,5 @@ def _padded(numbers: NDArray[np.intp]) -> NDArray[np.int32]:
 
 
 _LINEAR = np.rint(65535 * linear(np.arange(256) / 255)).astype(np.uint16)
+_ROOTS_OF_SRGB = np.rint(255 * np.sqrt(linear(np.arange(256) / 255))).astype(np.uint8)
 _ROOTS = np.rint(255 * np.sqrt((np.arange(4096) + 0.5) / 4096)).astype(np.uint8)
