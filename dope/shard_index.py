@@ -138,8 +138,10 @@ def verify_hashes(shards: Shards, split: str | None = None) -> None:
             raise BadInput("its SHA-256 is not the one in dataset.json", where=storage.where(name), remedy=REMAKE)
 
 
-def read_table(storage: Storage, name: str, columns: Sequence[str]) -> tuple[pa.Table, str]:
-    """A Parquet file that has these columns, and its SHA-256.
+def read_table(
+    storage: Storage, name: str, columns: Sequence[str], may_be_null: Sequence[str] = ()
+) -> tuple[pa.Table, str]:
+    """A Parquet file that has these columns, with a value in every row but those of `may_be_null`; and its SHA-256.
 
     Raises:
         BadInput: it is absent, damaged or lacks a column.
@@ -152,7 +154,7 @@ def read_table(storage: Storage, name: str, columns: Sequence[str]) -> tuple[pa.
     missing = [column for column in columns if column not in table.column_names]
     if missing:
         raise BadInput(f"lacks the columns {', '.join(missing)}", where=storage.where(name), remedy=REMAKE)
-    holes = [column for column in columns if table[column].null_count]
+    holes = [column for column in columns if table[column].null_count and column not in may_be_null]
     if holes:
         raise BadInput(f"has rows without {', '.join(holes)}", where=storage.where(name), remedy=REMAKE)
     return table, hashlib.sha256(data).hexdigest()

@@ -164,7 +164,7 @@ class ViewShards:
 
 def _read_columns(storage: Storage) -> dict[str, list[Any]]:
     storage.sizes()  # is there such a folder at all?
-    table, _ = read_table(storage, "views.parquet", COLUMNS)
+    table, _ = read_table(storage, "views.parquet", COLUMNS, may_be_null=("category",))
     if not len(table):
         raise BadInput("has no views", where=storage.where("views.parquet"), remedy=REMAKE)
     return {name: column.to_pylist() for name, column in zip(table.column_names, table.columns, strict=True)}

@@ -77,7 +77,7 @@ def test_ranks_that_are_asked_to_stop_have_the_time_they_need(
 def test_an_error_is_that_of_the_launcher_and_starts_nothing_again(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match=r"^here: what\. remedy$"):
         run(tmp_path, "with as_rank(): raise BadInput('what', where='here', remedy='remedy')", max_restarts=3)
-    assert starts(tmp_path) == 2
+    assert starts(tmp_path) <= 2 and not list(tmp_path.glob("started-*-1"))  # the other may end before it has begun
 
 
 @pytest.mark.parametrize("dies", ["os.kill(os.getpid(), 9)", "os._exit(1)", "raise WorkerDied('a worker')"])
