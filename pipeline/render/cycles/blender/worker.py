@@ -3,7 +3,8 @@
     python worker.py PARENT_PID MEMORY_BYTES
 
 {"do": "scene", "file": NPZ, ...} builds a scene; {"do": "shot", ...} renders one shot of it into an EXR file. The
-answer is {"ok": true}, or {"error": TEXT}, with the "number" of the request (0: it is ready). Ends when stdin does, or when its parent dies.
+answer is {"ok": true}, or {"error": TEXT}, with the "number" of the request (0: it is ready). Ends when stdin does, or
+when its parent dies.
 """
 
 from __future__ import annotations
