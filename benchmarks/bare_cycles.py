@@ -20,7 +20,7 @@ import numpy as np  # noqa: E402
 
 
 def main() -> None:
-    print(json.dumps({"ok": True, "blender": bpy.app.version_string}), file=answers, flush=True)
+    print(json.dumps({"ok": True, "number": 0, "blender": bpy.app.version_string}), file=answers, flush=True)
     ground = None
     for line in sys.stdin:
         request, seconds = json.loads(line), 0.0
@@ -32,7 +32,7 @@ def main() -> None:
             start = time.process_time()
             bpy.ops.render.render()
             seconds = time.process_time() - start
-        print(json.dumps({"ok": True, "seconds": seconds}), file=answers, flush=True)
+        print(json.dumps({"ok": True, "number": request["number"], "seconds": seconds}), file=answers, flush=True)
 
 
 if __name__ == "__main__":

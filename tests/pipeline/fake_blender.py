@@ -11,15 +11,29 @@ import sys
 import time
 from pathlib import Path
 
-MISDEEDS = ("none", "crash", "leave", "hang", "garbage", "twice", "list", "no_file", "half_file", "complain", "deaf")
+MISDEEDS = (
+    "none",
+    "crash",
+    "leave",
+    "hang",
+    "garbage",
+    "twice",
+    "list",
+    "no_file",
+    "half_file",
+    "complain",
+    "deaf",
+    "other",
+)
 
 
 def main() -> None:
     picture = Path(__file__).with_name("picture.exr")
-    print(json.dumps({"ok": True, "blender": "0.0 fake"}), flush=True)
+    print(json.dumps({"ok": True, "number": 0, "blender": "0.0 fake"}), flush=True)
     misdeed = "none"
     for line in sys.stdin:
         request = json.loads(line)
+        good = json.dumps({"ok": True, "number": request["number"]})
         if request["do"] == "scene":
             misdeed = MISDEEDS[request["seed"]]
         elif misdeed == "crash":
@@ -32,17 +46,20 @@ def main() -> None:
         elif misdeed == "garbage":
             print("Blender quit", flush=True)
         elif misdeed == "twice":
-            print(json.dumps({"ok": True}))
+            shutil.copy(picture, request["file"])
+            print(good, flush=True)
         elif misdeed == "list":
             print("[]", flush=True)
         elif misdeed == "half_file":
             Path(request["file"]).write_bytes(picture.read_bytes()[:-100])
         elif misdeed == "complain":
-            print(json.dumps({"error": "ValueError: no such thing"}), flush=True)
+            print(json.dumps({"error": "ValueError: no such thing", "number": request["number"]}), flush=True)
         elif misdeed != "no_file":
             shutil.copy(picture, request["file"])
+        if misdeed == "other" and request["do"] == "shot":
+            good = json.dumps({"ok": True, "number": request["number"] - 1})
         if misdeed not in ("garbage", "list", "complain") or request["do"] == "scene":
-            print(json.dumps({"ok": True}), flush=True)
+            print(good, flush=True)
         if misdeed == "deaf":
             os.close(1)
             time.sleep(60)

@@ -127,6 +127,7 @@ def test_a_white_object_is_as_bright_whatever_the_panorama() -> None:
         ("garbage", "makes no sense"),
         ("twice", "makes no sense"),
         ("list", "makes no sense"),
+        ("other", "makes no sense"),
         ("no_file", "picture cannot be read"),
         ("half_file", "picture cannot be read: ends after"),
         ("complain", "could not render it: ValueError: no such thing"),

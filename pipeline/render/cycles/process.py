@@ -61,7 +61,7 @@ class BlenderProcess:
     """
 
     def __init__(self, python: str, folder: Path, limits: Limits, script: Path | None = None) -> None:
-        self._limits, self._unread = limits, b""
+        self._limits, self._unread, self._asked = limits, b"", 0
         self._log = folder / "blender.log"
         command = [python, "-u", str(script or WORKER), str(os.getpid()), str(int(limits.memory_gib * 2**30))]
         try:
@@ -105,11 +105,13 @@ class BlenderProcess:
         """
         try:
             if message is not None:
-                self._send(json.dumps(message).encode() + b"\n", deadline)
-            line = self._read_line(deadline)
-            answer = json.loads(line)
+                self._asked += 1
+                self._send(json.dumps(message | {"number": self._asked}).encode() + b"\n", deadline)
+            answer = json.loads(self._read_line(deadline))
             if not isinstance(answer, dict) or ("ok" in answer) == ("error" in answer):
                 raise ValueError
+            if answer.get("number") != self._asked:
+                raise ValueError  # to something that was asked before
             return answer
         except TimeoutError:
             self.close()

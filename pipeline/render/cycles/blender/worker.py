@@ -3,7 +3,8 @@
     python worker.py PARENT_PID MEMORY_BYTES
 
 {"do": "scene", "file": NPZ, ...} builds a scene; {"do": "shot", ...} renders one shot of it into an EXR file. The
-answer is {"ok": true}, or {"error": TEXT}. Ends when stdin does, or when its parent dies.
+answer is {"ok": true}, or {"error": TEXT}, with the "number" of the request (0: it is ready). Ends when stdin does, or
+when its parent dies.
 """
 
 from __future__ import annotations
@@ -43,19 +44,19 @@ def main() -> None:
     requests, answers = take_descriptors()
     limit_process(int(sys.argv[1]), int(sys.argv[2]))
 
-    def answer(message: dict[str, Any]) -> None:
-        answers.write(json.dumps(message) + "\n")
+    def answer(number: int, message: dict[str, Any]) -> None:
+        answers.write(json.dumps(message | {"number": number}) + "\n")
         answers.flush()
 
     try:
         import bpy
     except ImportError as error:
-        answer({"error": f"no bpy: {error}"})
+        answer(0, {"error": f"no bpy: {error}"})
         os._exit(1)
     import build
     import numpy as np
 
-    answer({"ok": True, "blender": bpy.app.version_string})
+    answer(0, {"ok": True, "blender": bpy.app.version_string})
     ground: Any = None
     for line in requests:
         request = json.loads(line)
@@ -66,10 +67,10 @@ def main() -> None:
             else:
                 build.place_shot(bpy.context.scene, request, ground)
                 build.render_shot(bpy.context.scene, request["file"])
-            answer({"ok": True})
+            answer(request["number"], {"ok": True})
         except Exception as error:
             traceback.print_exc()
-            answer({"error": f"{type(error).__name__}: {error}"})
+            answer(request["number"], {"error": f"{type(error).__name__}: {error}"})
     with contextlib.suppress(Exception):
         sys.stderr.flush()
     os._exit(0)  # Blender's exit handlers have crashed after good work
