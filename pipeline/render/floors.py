@@ -60,7 +60,9 @@ def _stretched(rng: np.random.Generator, along: int, across: int, octaves: int) 
     return wide[:, 2 * ratio : 2 * ratio + SIZE]
 
 
-def _blocks(rng: np.random.Generator, rows: int, columns: int, shifts: _F32) -> tuple[NDArray[np.int64], _F32, _F32, _F32]:
+def _blocks(
+    rng: np.random.Generator, rows: int, columns: int, shifts: _F32
+) -> tuple[NDArray[np.int64], _F32, _F32, _F32]:
     """A running bond: each pixel's block, its distance in px to the block's edge, and its place (u, v) in the block."""
     height, width = SIZE // rows, SIZE / columns
     row = (_Y // height).astype(np.int64)
@@ -68,7 +70,12 @@ def _blocks(rng: np.random.Generator, rows: int, columns: int, shifts: _F32) -> 
     column = (x // width).astype(np.int64)
     u, v = x - column * width + 0.5, _Y - row * height + 0.5
     edge = np.minimum(np.minimum(u, width - u), np.minimum(v, height - v))
-    return row * columns + column, edge.astype(np.float32), (u / width).astype(np.float32), (v / height).astype(np.float32)
+    return (
+        row * columns + column,
+        edge.astype(np.float32),
+        (u / width).astype(np.float32),
+        (v / height).astype(np.float32),
+    )
 
 
 def _planks(rng: np.random.Generator, colours: _F32) -> _Made:
@@ -80,7 +87,9 @@ def _planks(rng: np.random.Generator, colours: _F32) -> _Made:
     grain = long[y, x]
     rings = np.sin(6 * grain + 0.5 * fine)
     tone = rng.normal(0, 0.35, rows * columns)[block]
-    colour = _mix(colours[0], colours[1], np.clip(0.5 + 0.22 * rings + 0.12 * fine + tone * 0.5, 0, 1).astype(np.float32))
+    colour = _mix(
+        colours[0], colours[1], np.clip(0.5 + 0.22 * rings + 0.12 * fine + tone * 0.5, 0, 1).astype(np.float32)
+    )
     gap = smooth_step(0.6, 2.2, edge)
     colour = colour * (0.35 + 0.65 * gap)[..., None]
     return colour, 0.006 * gap + 0.0006 * rings, rng.uniform(0.35, 0.6), 2.4

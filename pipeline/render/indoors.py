@@ -81,7 +81,9 @@ def _panel(
     depth = toward @ ahead
     before = np.maximum(depth, 1e-3)
     x, y = np.abs(toward @ right) / before, np.abs(toward @ top) / before
-    inside = smooth_step(half_width + soft, half_width - soft, x) * smooth_step(half_height + soft, half_height - soft, y)
+    inside = smooth_step(half_width + soft, half_width - soft, x) * smooth_step(
+        half_height + soft, half_height - soft, y
+    )
     return np.where(depth > 0, inside, 0)
 
 

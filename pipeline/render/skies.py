@@ -178,7 +178,9 @@ def _outdoors(toward: _F32, rng: _Rng, sun_deg: float, cover: float, sharp: floa
     light = _mix(light, lit[..., None] * colour * (1.1 + 0.5 * sharp), clouds)
     disc = smooth_step(np.cos(np.radians(2.2)), np.cos(np.radians(1.4)), near)
     power = sharp * (1500 - 700 * low)
-    light = light + (disc * power * (1 - 0.85 * clouds))[..., None] * (np.array([1.0, 0.55, 0.22]) if low > 0.5 else warm)
+    light = light + (disc * power * (1 - 0.85 * clouds))[..., None] * (
+        np.array([1.0, 0.55, 0.22]) if low > 0.5 else warm
+    )
     return _with_land(toward, light, rng, sharp, low)
 
 

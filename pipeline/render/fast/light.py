@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.geometry import Floats
 from pipeline.render.fast.geometry import linear
@@ -163,7 +162,7 @@ def _white(harmonics: Floats, keys: Floats, key_directions: Floats) -> Floats:
 
 
 def _exposure(white: Floats, albedo: float) -> Floats:
-    """What a camera would set: WHITE for a white object, less over a bright ground, and half of the light's hue gone."""
+    """As a camera would: WHITE for a white object, less over a bright ground, and half of the light's hue gone."""
     bright = float(white @ LUMINANCE)
     scale = WHITE / bright * np.clip(USUAL_ALBEDO / max(albedo, 1e-3), 0.2, 5) ** 0.35
     return np.asarray(scale * (bright / white) ** 0.6)

@@ -253,7 +253,7 @@ class SceneOnDevice:
         return made
 
     def _levels(self, levels: list[NDArray[Any]]) -> Any:
-        """A texture with the given mip levels, from the process's stock: to make one anew takes longer than to fill it."""
+        """A texture of mip levels, from the process's stock: to make one anew takes longer than to fill it."""
         first = levels[0]
         made = take_texture(first.shape[1], first.shape[0], first.shape[2], first.dtype)
         self._stack.callback(give_texture, made)
@@ -283,7 +283,7 @@ def slopes_of(bumps: NDArray[np.float32], side: float) -> NDArray[np.float32]:
 
 
 def shadow_reach(directions: Floats, geometry: Geometry, height: float) -> float:
-    """Half the side of the square of ground, around the world's origin, that shadows along directions (N, 3) fall on."""
+    """Half the side of the square of ground around the origin that shadows along directions (N, 3) fall on."""
     corners = geometry.corners()
     far = float(np.abs(corners[:, :2]).max())
     if len(directions):
