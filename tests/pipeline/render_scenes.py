@@ -65,7 +65,7 @@ def sunny(azimuth_deg: float, elevation_deg: float, power: float = 400.0, rows: 
     sky = panorama(1.0, rows)
     row = round((90 - elevation_deg) / 180 * rows)
     column = round((0.5 - azimuth_deg / 360) * 2 * rows) % (2 * rows)
-    sky[row - 1 : row + 1, column - 1 : column + 1] = power
+    sky[row - 1 : row + 1, [column - 1, column]] = power
     return sky
 
 

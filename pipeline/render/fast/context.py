@@ -77,7 +77,7 @@ def _context(process: int) -> moderngl.Context:
         raise DopeError("rendering needs the package moderngl", remedy=remedy) from error
     os.environ.setdefault("LP_NUM_THREADS", "1")
     try:
-        made = moderngl.create_context(standalone=True, backend="egl", require=MIN_VERSION)
+        made: Any = moderngl.create_context(standalone=True, backend="egl", require=MIN_VERSION)  # type: ignore[arg-type]
     except Exception as error:  # what it raises is a bare Exception, of many causes
         remedy = f"On Debian: `apt-get install {PACKAGES}`; or render with --renderer cycles"
         raise DopeError(f"no OpenGL {MIN_VERSION / 100:.1f} through EGL ({error})", remedy=remedy) from error
