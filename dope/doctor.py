@@ -60,9 +60,19 @@ REQUIRED = (
 )
 
 OPTIONAL = (
-    ("moderngl", "moderngl", "dope prep render", "pip install 'dope-descriptors[render]', and libegl1, libgl1-mesa-dri"),
+    (
+        "moderngl",
+        "moderngl",
+        "dope prep render, with libegl1 libgl1-mesa-dri",
+        "pip install 'dope-descriptors[render]'",
+    ),
     ("scipy", "scipy", "dope prep render", "pip install 'dope-descriptors[render]'"),
-    ("Blender (bpy)", "bpy", "dope prep render --renderer cycles", "python3.11 -m venv bpyenv && bpyenv/bin/pip install bpy==4.5.*"),
+    (
+        "Blender (bpy)",
+        "bpy",
+        "dope prep render --renderer cycles; may lie in an environment of its own",
+        "python3.11 -m venv bpyenv && bpyenv/bin/pip install 'bpy==4.5.*' 'numpy<2'",
+    ),
     ("OpenEXR", "OpenEXR", "depth maps in EXR files", "pip install 'dope-descriptors[exr]'"),
     ("Weights & Biases", "wandb", "--set log.wandb=PROJECT of dope train", "pip install 'dope-descriptors[wandb]'"),
     ("s3fs", "s3fs", "shards in s3://", "pip install '.[s3]'"),

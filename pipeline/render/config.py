@@ -77,7 +77,7 @@ class CyclesConfig:
     bounces: int = 4
     """Most bounces of a path."""
     python: str | None = None
-    """Python interpreter whose environment has bpy; None: this one."""
+    """Python interpreter whose environment has bpy; None: $DOPE_BPY_PYTHON, else this one."""
 
     def __post_init__(self) -> None:
         settings.require_at_least(self, samples=1, bounces=0)

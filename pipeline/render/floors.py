@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,7 +14,7 @@ from dope.common import seeds
 from pipeline.render.noise import smooth_step, wrapping_noise
 
 SIZE = 512
-_F32 = NDArray[np.float32]
+_Plane = NDArray[Any]  # (SIZE, SIZE) or (SIZE, SIZE, 3)
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,7 @@ class Floor:
     """See `grounds.Material`, whose fields these are."""
 
     albedo: NDArray[np.uint8]
-    bumps: _F32 | None
+    bumps: NDArray[np.float32] | None
     roughness: float
     side: float
 
@@ -37,21 +38,21 @@ def floor(number: int) -> Floor:
 
 
 # Each kind: a generator and sRGB colours (K, 3) to colour (SIZE, SIZE, 3), heights or None, roughness, side.
-_Made = tuple[_F32, _F32 | None, float, float]
-_Kind = Callable[[np.random.Generator, _F32], _Made]
+_Made = tuple[_Plane, _Plane | None, float, float]
+_Kind = Callable[[np.random.Generator, _Plane], _Made]
 
 _Y, _X = np.mgrid[0:SIZE, 0:SIZE].astype(np.float32)
 
 
-def _noise(rng: np.random.Generator, coarsest: int, octaves: int, fade: float = 0.6) -> _F32:
+def _noise(rng: np.random.Generator, coarsest: int, octaves: int, fade: float = 0.6) -> _Plane:
     return wrapping_noise(rng, SIZE, SIZE, coarsest, octaves, fade)
 
 
-def _mix(a: _F32, b: _F32, share: _F32) -> _F32:
+def _mix(a: _Plane, b: _Plane, share: _Plane) -> _Plane:
     return np.asarray(a + (b - a) * np.asarray(share, np.float32)[..., None], np.float32)
 
 
-def _stretched(rng: np.random.Generator, along: int, across: int, octaves: int) -> _F32:
+def _stretched(rng: np.random.Generator, along: int, across: int, octaves: int) -> _Plane:
     """Noise (SIZE, SIZE) that is `along` px long in x and `across` px in y."""
     ratio = max(1, along // across)
     small = wrapping_noise(rng, SIZE, SIZE // ratio, across, octaves)
@@ -60,35 +61,36 @@ def _stretched(rng: np.random.Generator, along: int, across: int, octaves: int) 
     return wide[:, 2 * ratio : 2 * ratio + SIZE]
 
 
-def _blocks(rng: np.random.Generator, rows: int, columns: int, shifts: _F32) -> tuple[NDArray[np.int64], _F32, _F32, _F32]:
-    """A running bond: each pixel's block, its distance in px to the block's edge, and its place (u, v) in the block."""
+def _blocks(rows: int, columns: int, shifts: _Plane) -> tuple[_Plane, _Plane]:
+    """A running bond: each pixel's block, and its distance in px to the block's edge."""
     height, width = SIZE // rows, SIZE / columns
     row = (_Y // height).astype(np.int64)
     x = (_X + shifts[row] * width) % SIZE
     column = (x // width).astype(np.int64)
     u, v = x - column * width + 0.5, _Y - row * height + 0.5
-    edge = np.minimum(np.minimum(u, width - u), np.minimum(v, height - v))
-    return row * columns + column, edge.astype(np.float32), (u / width).astype(np.float32), (v / height).astype(np.float32)
+    return row * columns + column, np.minimum(np.minimum(u, width - u), np.minimum(v, height - v))
 
 
-def _planks(rng: np.random.Generator, colours: _F32) -> _Made:
+def _planks(rng: np.random.Generator, colours: _Plane) -> _Made:
     rows, columns = int(rng.choice([4, 8])), 2
-    block, edge, _, _ = _blocks(rng, rows, columns, rng.random(rows).astype(np.float32))
+    block, edge = _blocks(rows, columns, rng.random(rows).astype(np.float32))
     shift = rng.integers(0, SIZE, (rows * columns, 2))
     long, fine = _stretched(rng, 256, 8, 4), _stretched(rng, 64, 2, 2)
     y, x = (_Y.astype(np.int64) + shift[block, 0]) % SIZE, (_X.astype(np.int64) + shift[block, 1]) % SIZE
     grain = long[y, x]
     rings = np.sin(6 * grain + 0.5 * fine)
     tone = rng.normal(0, 0.35, rows * columns)[block]
-    colour = _mix(colours[0], colours[1], np.clip(0.5 + 0.22 * rings + 0.12 * fine + tone * 0.5, 0, 1).astype(np.float32))
+    colour = _mix(
+        colours[0], colours[1], np.clip(0.5 + 0.22 * rings + 0.12 * fine + tone * 0.5, 0, 1).astype(np.float32)
+    )
     gap = smooth_step(0.6, 2.2, edge)
     colour = colour * (0.35 + 0.65 * gap)[..., None]
     return colour, 0.006 * gap + 0.0006 * rings, rng.uniform(0.35, 0.6), 2.4
 
 
-def _tiles(rng: np.random.Generator, colours: _F32) -> _Made:
+def _tiles(rng: np.random.Generator, colours: _Plane) -> _Made:
     count = int(rng.choice([4, 8]))
-    block, edge, _, _ = _blocks(rng, count, count, np.zeros(count, np.float32))
+    block, edge = _blocks(count, count, np.zeros(count, np.float32))
     shade = rng.normal(0, 0.03, count * count)[block]
     stain = _noise(rng, 64, 5)
     face = colours[0] * (1 + shade + 0.03 * stain)[..., None]
@@ -98,7 +100,7 @@ def _tiles(rng: np.random.Generator, colours: _F32) -> _Made:
     return colour, 0.008 * smooth_step(1.0, 6.0, edge), rng.uniform(0.15, 0.4), 2.0
 
 
-def _checker(rng: np.random.Generator, colours: _F32) -> _Made:
+def _checker(rng: np.random.Generator, colours: _Plane) -> _Made:
     count = int(rng.choice([4, 6, 8]))
     cell = SIZE / count
     odd = ((_X // cell + _Y // cell) % 2).astype(np.float32)
@@ -109,9 +111,9 @@ def _checker(rng: np.random.Generator, colours: _F32) -> _Made:
     return colour * (0.75 + 0.25 * smooth_step(0.4, 1.6, edge))[..., None], None, rng.uniform(0.15, 0.45), 2.0
 
 
-def _bricks(rng: np.random.Generator, colours: _F32) -> _Made:
+def _bricks(rng: np.random.Generator, colours: _Plane) -> _Made:
     rows, columns = 8, 4
-    block, edge, _, _ = _blocks(rng, rows, columns, np.where(np.arange(rows) % 2, 0.5, 0.0).astype(np.float32))
+    block, edge = _blocks(rows, columns, np.where(np.arange(rows) % 2, 0.5, 0.0).astype(np.float32))
     rough = _noise(rng, 16, 4)
     shade = rng.normal(0, 0.14, rows * columns)[block]
     face = colours[0] * (1 + shade + 0.08 * rough)[..., None]
@@ -120,14 +122,14 @@ def _bricks(rng: np.random.Generator, colours: _F32) -> _Made:
     return colour, 0.009 * inside + 0.001 * rough, 0.85, 2.0
 
 
-def _concrete(rng: np.random.Generator, colours: _F32) -> _Made:
+def _concrete(rng: np.random.Generator, colours: _Plane) -> _Made:
     large, fine = _noise(rng, 128, 5, 0.7), _noise(rng, 8, 4, 0.8)
     colour = _mix(colours[0], colours[1], np.clip(0.5 + 0.25 * large, 0, 1)) * (1 + 0.03 * fine)[..., None]
     holes = smooth_step(2.3, 2.9, _noise(rng, 8, 2))
     return colour * (1 - 0.35 * holes)[..., None], 0.0012 * fine - 0.004 * holes, rng.uniform(0.6, 0.9), 2.5
 
 
-def _marble(rng: np.random.Generator, colours: _F32) -> _Made:
+def _marble(rng: np.random.Generator, colours: _Plane) -> _Made:
     warp = _noise(rng, 128, 5, 0.55)
     veins = np.abs(_noise(rng, 128, 4, 0.5) + 0.35 * warp)
     thin = np.exp(-veins * 9) + 0.5 * np.exp(-np.abs(_noise(rng, 64, 5, 0.55)) * 16)
@@ -135,7 +137,7 @@ def _marble(rng: np.random.Generator, colours: _F32) -> _Made:
     return colour, None, rng.uniform(0.08, 0.25), 2.5
 
 
-def _cloth(rng: np.random.Generator, colours: _F32) -> _Made:
+def _cloth(rng: np.random.Generator, colours: _Plane) -> _Made:
     threads = int(rng.choice([48, 64, 96]))
     a, b = 2 * np.pi * threads * _X / SIZE, 2 * np.pi * threads * _Y / SIZE
     over = np.cos(a / 2) * np.cos(b / 2) > 0
@@ -149,16 +151,16 @@ def _cloth(rng: np.random.Generator, colours: _F32) -> _Made:
     return colour, 0.002 * weave, 0.95, 1.2
 
 
-def _carpet(rng: np.random.Generator, colours: _F32) -> _Made:
+def _carpet(rng: np.random.Generator, colours: _Plane) -> _Made:
     tuft, blotch = _noise(rng, 4, 3, 0.9), _noise(rng, 64, 4)
     share = np.clip(0.5 + 0.3 * tuft + 0.12 * blotch, 0, 1)
     return _mix(colours[0], colours[1], share), 0.0012 * tuft, 1.0, 1.6
 
 
-def _gravel(rng: np.random.Generator, colours: _F32) -> _Made:
+def _gravel(rng: np.random.Generator, colours: _Plane) -> _Made:
     count = int(rng.integers(18, 34))
     cell = SIZE / count
-    sites = (np.stack(np.mgrid[0:count, 0:count], axis=-1) + rng.uniform(0.1, 0.9, (count, count, 2))) * cell
+    sites = (np.moveaxis(np.mgrid[0:count, 0:count], 0, -1) + rng.uniform(0.1, 0.9, (count, count, 2))) * cell
     y, x = (_Y // cell).astype(np.int64), (_X // cell).astype(np.int64)
     nearest = np.full((SIZE, SIZE), np.inf, np.float32)
     second, owner = nearest.copy(), np.zeros((SIZE, SIZE), np.int64)
@@ -178,14 +180,14 @@ def _gravel(rng: np.random.Generator, colours: _F32) -> _Made:
     return face * (0.3 + 0.7 * dome)[..., None], (0.35 * cell / SIZE * dome).astype(np.float32), 0.9, 1.8
 
 
-def _grass(rng: np.random.Generator, colours: _F32) -> _Made:
+def _grass(rng: np.random.Generator, colours: _Plane) -> _Made:
     fine = 0.5 * (_stretched(rng, 8, 2, 2) + _stretched(rng, 8, 2, 2).T) + 0.5 * _noise(rng, 4, 3, 0.9)
     patch = _noise(rng, 128, 4)
     share = np.clip(0.5 + 0.28 * fine + 0.15 * patch, 0, 1)
     return _mix(colours[0], colours[1], share) * (1 + 0.12 * fine)[..., None], 0.002 * fine, 1.0, 2.5
 
 
-def _sand(rng: np.random.Generator, colours: _F32) -> _Made:
+def _sand(rng: np.random.Generator, colours: _Plane) -> _Made:
     warp = _noise(rng, 128, 4)
     ripple = np.sin(2 * np.pi * 9 * _Y / SIZE + 1.4 * warp).astype(np.float32)
     grain = _noise(rng, 2, 2)
@@ -193,12 +195,12 @@ def _sand(rng: np.random.Generator, colours: _F32) -> _Made:
     return _mix(colours[0], colours[1], share), 0.006 * ripple + 0.0004 * grain, 0.95, 2.5
 
 
-def _paint(rng: np.random.Generator, colours: _F32) -> _Made:
+def _paint(rng: np.random.Generator, colours: _Plane) -> _Made:
     colour = colours[0] * (1 + 0.02 * _noise(rng, 128, 6))[..., None]
     return colour.astype(np.float32), None, rng.uniform(0.3, 0.8), 3.0
 
 
-def _terrazzo(rng: np.random.Generator, colours: _F32) -> _Made:
+def _terrazzo(rng: np.random.Generator, colours: _Plane) -> _Made:
     colour = colours[0] * (1 + 0.02 * _noise(rng, 64, 4))[..., None]
     for number in range(3):
         chip = smooth_step(1.15, 1.35, _noise(rng, (32, 16, 16)[number], 2, 0.35)).astype(np.float32)
@@ -206,13 +208,13 @@ def _terrazzo(rng: np.random.Generator, colours: _F32) -> _Made:
     return colour, None, rng.uniform(0.1, 0.3), 2.0
 
 
-def _cork(rng: np.random.Generator, colours: _F32) -> _Made:
+def _cork(rng: np.random.Generator, colours: _Plane) -> _Made:
     speck = np.abs(_noise(rng, 16, 4, 0.8))
     share = np.clip(0.75 - 0.5 * speck, 0, 1)
     return _mix(colours[0], colours[1], share), -0.001 * speck, 0.9, 1.6
 
 
-def _parquet(rng: np.random.Generator, colours: _F32) -> _Made:
+def _parquet(rng: np.random.Generator, colours: _Plane) -> _Made:
     """Squares of strips that lie across each other."""
     count, strips = 4, 5
     cell = SIZE // count

@@ -6,6 +6,7 @@ import re
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -51,10 +52,14 @@ class Material:
         return Ground(height, self.albedo, self.bumps, self.roughness, self.side)
 
 
-@lru_cache(maxsize=CACHE)
 def ground_material(number: int) -> Material:
     """The procedural material of a number (0 ... COUNT - 1; others take part modulo COUNT), SIZE pixels square."""
-    made = floor(number % COUNT)
+    return _ground_material(number % COUNT)
+
+
+@lru_cache(maxsize=CACHE)
+def _ground_material(number: int) -> Material:
+    made = floor(number)
     return _frozen(Material(made.albedo, made.bumps, made.roughness, made.side))
 
 
@@ -105,8 +110,7 @@ def _read_material(path: Path, changed: tuple[int, ...]) -> Material:
     others = {role: next((file for file in _pictures(path) if _role(file) == role), None) for role in ROLES}
     bumps, roughness = None, Material.roughness
     if others["bumps"] is not None:
-        height = _grey(others["bumps"])
-        height = cv2.resize(height, albedo.shape[1::-1], interpolation=cv2.INTER_AREA)
+        height = cv2.resize(_grey(others["bumps"]), albedo.shape[1::-1], interpolation=cv2.INTER_AREA)
         bumps = ((height - height.mean()) * FILE_BUMPS).astype(np.float32)
     if others["roughness"] is not None:
         roughness = float(_grey(others["roughness"]).mean())
@@ -134,7 +138,7 @@ def _role(path: Path) -> str | None:
     return None
 
 
-def _decoded(path: Path, flags: int) -> NDArray[np.generic]:
+def _decoded(path: Path, flags: int) -> NDArray[Any]:
     try:
         return decode(path.read_bytes(), flags)
     except OSError as error:
@@ -143,7 +147,7 @@ def _decoded(path: Path, flags: int) -> NDArray[np.generic]:
         raise BadInput(error.what, where=path, remedy=error.remedy) from error
 
 
-def _shrunk(picture: NDArray[np.generic]) -> NDArray[np.generic]:
+def _shrunk(picture: NDArray[Any]) -> NDArray[Any]:
     scale = min(1.0, MAX_SIDE / max(picture.shape[:2]))
     size = (max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale)))
     return picture if scale == 1 else np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))

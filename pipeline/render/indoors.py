@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.render.noise import smooth_step, wrapping_noise
 
-_F32 = NDArray[np.float32]
+_Plane = NDArray[Any]
 
 
-def studio(toward: _F32, rng: np.random.Generator) -> _F32:
+def studio(toward: _Plane, rng: np.random.Generator) -> _Plane:
     """A backdrop that goes from floor to dark ceiling without an edge, and two to four soft boxes."""
     up = toward[..., 2]
     tint = 1 + rng.uniform(-0.08, 0.08, 3)
@@ -32,7 +34,7 @@ def studio(toward: _F32, rng: np.random.Generator) -> _F32:
     return light.astype(np.float32)
 
 
-def room(toward: _F32, rng: np.random.Generator) -> _F32:
+def room(toward: _Plane, rng: np.random.Generator) -> _Plane:
     """A box with windows or lamps, things on and before its walls, seen from 1.2 m above its floor."""
     half = np.array([rng.uniform(2, 5), rng.uniform(2, 5)])
     ceiling, eye = rng.uniform(2.4, 3.6), 1.2
@@ -47,7 +49,7 @@ def room(toward: _F32, rng: np.random.Generator) -> _F32:
     light = np.empty((*toward.shape[:2], 3))
     light[:] = paint * rng.uniform(0.55, 0.9)
     floor = (axis == 2) & (toward[..., 2] < 0)
-    grain = wrapping_noise(rng, *toward.shape[:2], 16, 4)
+    grain = wrapping_noise(rng, toward.shape[0], toward.shape[1], 16, 4)
     wood = np.array([0.36, 0.23, 0.13]) * rng.uniform(0.6, 1.6) if rng.random() < 0.7 else np.full(3, 0.35)
     light[floor] = wood * (1 + 0.15 * grain[floor][:, None])
     roof = (axis == 2) & ~floor
@@ -71,7 +73,7 @@ def _paint(rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def _panel(
-    toward: _F32, azimuth: float, elevation: float, half_width: float, half_height: float, soft: float
+    toward: _Plane, azimuth: float, elevation: float, half_width: float, half_height: float, soft: float
 ) -> NDArray[np.floating]:
     """How much of a rectangle in the plane before a direction each ray meets, with a soft rim."""
     flat = np.cos(elevation)
@@ -81,12 +83,14 @@ def _panel(
     depth = toward @ ahead
     before = np.maximum(depth, 1e-3)
     x, y = np.abs(toward @ right) / before, np.abs(toward @ top) / before
-    inside = smooth_step(half_width + soft, half_width - soft, x) * smooth_step(half_height + soft, half_height - soft, y)
+    inside = smooth_step(half_width + soft, half_width - soft, x) * smooth_step(
+        half_height + soft, half_height - soft, y
+    )
     return np.where(depth > 0, inside, 0)
 
 
 def _rectangle(
-    on: NDArray[np.bool_], x: _F32, y: _F32, low: tuple[float, float], high: tuple[float, float]
+    on: NDArray[np.bool_], x: _Plane, y: _Plane, low: tuple[float, float], high: tuple[float, float]
 ) -> NDArray[np.bool_]:
     return on & (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1])
 
@@ -94,8 +98,8 @@ def _rectangle(
 def _furnish(
     light: NDArray[np.float64],
     on: NDArray[np.bool_],
-    x: _F32,
-    y: _F32,
+    x: _Plane,
+    y: _Plane,
     half: float,
     ceiling: float,
     rng: np.random.Generator,
@@ -124,8 +128,8 @@ def _furnish(
 def _windows(
     light: NDArray[np.float64],
     on: NDArray[np.bool_],
-    x: _F32,
-    y: _F32,
+    x: _Plane,
+    y: _Plane,
     half: float,
     ceiling: float,
     rng: np.random.Generator,
@@ -148,7 +152,7 @@ def _windows(
 def _lamps(
     light: NDArray[np.float64],
     roof: NDArray[np.bool_],
-    point: _F32,
+    point: _Plane,
     half: NDArray[np.float64],
     rng: np.random.Generator,
 ) -> None:
@@ -163,7 +167,7 @@ def _lamps(
         light[roof & shape] = power * warm
 
 
-def _corners(point: _F32, half: NDArray[np.float64], ceiling: float) -> NDArray[np.floating]:
+def _corners(point: _Plane, half: NDArray[np.float64], ceiling: float) -> NDArray[np.floating]:
     """Rooms are darker towards their edges."""
     gaps = [half[0] - np.abs(point[..., 0]), half[1] - np.abs(point[..., 1]), point[..., 2], ceiling - point[..., 2]]
     second = np.sort(np.stack(gaps), axis=0)[1]  # the nearest is the wall itself

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +38,7 @@ def enlarged(grid: NDArray[np.float32], height: int, width: int) -> NDArray[np.f
     return np.ascontiguousarray(large[y : y + height, x : x + width])
 
 
-def smooth_step(low: float, high: float, x: NDArray[np.floating]) -> NDArray[np.floating]:
+def smooth_step(low: float, high: float, x: NDArray[Any]) -> NDArray[Any]:
     """0 below `low`, 1 above `high` (or the other way round), smooth between."""
     t = np.clip((x - low) / (high - low), 0, 1)
     return t * t * (3 - 2 * t)

@@ -6,7 +6,6 @@ All are (ROWS, 2 ROWS, 3) float32 linear RGB, laid out as `scene.Light` says and
 from __future__ import annotations
 
 import io
-import os
 from contextlib import redirect_stdout
 from functools import lru_cache
 from pathlib import Path
@@ -41,10 +40,13 @@ def directions_of(rows: int, turn: float = 0.0) -> tuple[Floats, Floats]:
     return np.stack(xyz, axis=-1), flat * (np.pi / rows) ** 2
 
 
-@lru_cache(maxsize=CACHE)
 def sky(number: int) -> Panorama:
     """The procedural panorama of a number (0 ... COUNT - 1; others take part modulo COUNT). Not to be written to."""
-    number %= COUNT
+    return _sky(number % COUNT)
+
+
+@lru_cache(maxsize=CACHE)
+def _sky(number: int) -> Panorama:
     rng = seeds.generator("sky", number)
     toward, _ = directions_of(ROWS)
     kind = _KINDS[number % len(_KINDS)]
@@ -77,10 +79,10 @@ def read_sky(path: Path) -> Panorama:
         BadInput: the file cannot be read, is not twice as wide as high, or is black; for EXR also where the optional
             OpenEXR is not installed.
     """
-    return _read_sky(path, os.stat(path).st_mtime_ns if path.exists() else 0)
+    return _read_sky(path, path.stat().st_mtime_ns if path.exists() else 0)
 
 
-def normalised(panorama: NDArray[np.floating]) -> Panorama:
+def normalised(panorama: NDArray[Any]) -> Panorama:
     """Cleaned of what is no light and divided by its mean over the sphere. Raises BadInput where it is black."""
     light = np.nan_to_num(np.asarray(panorama, np.float64), nan=0, posinf=0, neginf=0).clip(0, None)
     _, angle = directions_of(len(light))
@@ -149,14 +151,14 @@ def _read_exr(path: Path) -> NDArray[Any]:
 # ---- skies
 
 _Rng = np.random.Generator
-_F32 = NDArray[np.float32]
+_Plane = NDArray[Any]  # (ROWS, 2 ROWS) or (ROWS, 2 ROWS, 3)
 
 
-def _mix(a: Any, b: Any, share: _F32) -> _F32:
-    return np.asarray(a + (b - a) * share[..., None], np.float32)
+def _mix(a: Any, b: Any, share: Any) -> _Plane:
+    return np.asarray(a + (b - a) * np.asarray(share)[..., None], np.float32)
 
 
-def _outdoors(toward: _F32, rng: _Rng, sun_deg: float, cover: float, sharp: float) -> _F32:
+def _outdoors(toward: _Plane, rng: _Rng, sun_deg: float, cover: float, sharp: float) -> _Plane:
     """A sky with its sun at a height, clouds that cover a share of it, and land.
 
     sharp: how strong the sun is, 1 on a clear day and 0 behind clouds.
@@ -165,8 +167,8 @@ def _outdoors(toward: _F32, rng: _Rng, sun_deg: float, cover: float, sharp: floa
     sun = _direction(rng.uniform(0, 2 * np.pi), np.radians(sun_deg))
     near = toward @ sun
     low = float(np.clip(1 - sun_deg / 25, 0, 1))  # how much of a sunset it is
-    zenith = _mix(np.array([0.16, 0.34, 0.85]), np.array([0.20, 0.26, 0.52]), np.float32(low))
-    horizon = _mix(np.array([0.72, 0.86, 1.05]), np.array([1.25, 0.72, 0.42]), np.float32(low))
+    zenith = _mix(np.array([0.16, 0.34, 0.85]), np.array([0.20, 0.26, 0.52]), low)
+    horizon = _mix(np.array([0.72, 0.86, 1.05]), np.array([1.25, 0.72, 0.42]), low)
     height = np.maximum(up, 0) ** rng.uniform(0.42, 0.6)
     light = _mix(horizon, zenith, height)
     warm = np.array([1.0, 0.62, 0.30]) if low > 0.2 else np.array([1.0, 0.95, 0.85])
@@ -174,27 +176,28 @@ def _outdoors(toward: _F32, rng: _Rng, sun_deg: float, cover: float, sharp: floa
     light = light + (sharp * glow)[..., None] * warm
     clouds, body = _clouds(toward, rng, cover)
     lit = 0.55 + 0.9 * np.maximum(near, 0) ** 3 * (1 - 0.5 * body) + 0.25 * (1 - body)
-    colour = _mix(np.array([0.86, 0.89, 0.95]), np.array([1.15, 0.74, 0.55]), np.float32(low))
+    colour = _mix(np.array([0.86, 0.89, 0.95]), np.array([1.15, 0.74, 0.55]), low)
     light = _mix(light, lit[..., None] * colour * (1.1 + 0.5 * sharp), clouds)
     disc = smooth_step(np.cos(np.radians(2.2)), np.cos(np.radians(1.4)), near)
     power = sharp * (1500 - 700 * low)
-    light = light + (disc * power * (1 - 0.85 * clouds))[..., None] * (np.array([1.0, 0.55, 0.22]) if low > 0.5 else warm)
+    hue = np.array([1.0, 0.55, 0.22]) if low > 0.5 else warm
+    light = light + (disc * power * (1 - 0.85 * clouds))[..., None] * hue
     return _with_land(toward, light, rng, sharp, low)
 
 
-def _clouds(toward: _F32, rng: _Rng, cover: float) -> tuple[_F32, _F32]:
+def _clouds(toward: _Plane, rng: _Rng, cover: float) -> tuple[_Plane, _Plane]:
     """How much of a cloud and how deep in it each direction looks, in [0, 1]; a flat layer, so smaller far away."""
     tile = wrapping_noise(rng, 512, 512, 128, 6, fade=0.55)
     up = np.maximum(toward[..., 2], 0.02)
     scale = 512 / rng.uniform(5, 9)
     x, y = (toward[..., axis] / (up + 0.12) * scale for axis in (0, 1))
-    shape = cv2.remap(tile, x % 512, y % 512, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    shape: _Plane = cv2.remap(tile, x % 512, y % 512, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
     edge = float(np.quantile(tile, 1 - cover)) if cover < 1 else float(tile.min()) - 0.6
     dense = smooth_step(edge - 0.15, edge + 0.55, shape)
     return dense * smooth_step(-0.02, 0.12, toward[..., 2]), smooth_step(edge, edge + 1.8, shape)
 
 
-def _with_land(toward: _F32, light: _F32, rng: _Rng, sharp: float, low: float) -> _F32:
+def _with_land(toward: _Plane, light: _Plane, rng: _Rng, sharp: float, low: float) -> _Plane:
     """Hills, trees or houses along the horizon, and land below it."""
     rows = len(toward)
     up = np.degrees(np.arcsin(np.clip(toward[..., 2], -1, 1)))
@@ -227,24 +230,24 @@ def _with_land(toward: _F32, light: _F32, rng: _Rng, sharp: float, low: float) -
     return _mix(light, below, smooth_step(0.4, -0.4, up.astype(np.float32)))
 
 
-def _direction(azimuth: float, elevation: float) -> _F32:
+def _direction(azimuth: float, elevation: float) -> _Plane:
     flat = np.cos(elevation)
     return np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], np.float32)
 
 
-def _clear(toward: _F32, rng: _Rng) -> _F32:
+def _clear(toward: _Plane, rng: _Rng) -> _Plane:
     return _outdoors(toward, rng, rng.uniform(25, 65), rng.uniform(0.02, 0.2), 1.0)
 
 
-def _cloudy(toward: _F32, rng: _Rng) -> _F32:
+def _cloudy(toward: _Plane, rng: _Rng) -> _Plane:
     return _outdoors(toward, rng, rng.uniform(25, 65), rng.uniform(0.35, 0.6), rng.uniform(0.4, 0.9))
 
 
-def _overcast(toward: _F32, rng: _Rng) -> _F32:
+def _overcast(toward: _Plane, rng: _Rng) -> _Plane:
     return _outdoors(toward, rng, rng.uniform(30, 60), 1.0, rng.uniform(0.0, 0.06))
 
 
-def _sunset(toward: _F32, rng: _Rng) -> _F32:
+def _sunset(toward: _Plane, rng: _Rng) -> _Plane:
     return _outdoors(toward, rng, rng.uniform(5, 14), rng.uniform(0.1, 0.5), rng.uniform(0.5, 1.0))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -44,7 +44,7 @@ _stock: dict[tuple[object, ...], list[moderngl.Texture]] = {}
 
 
 def take_texture(width: int, height: int, components: int, dtype: np.dtype[Any]) -> moderngl.Texture:
-    """A texture with room for all mip levels, trilinear and repeating, for uint8 or float32. Its content is left over."""
+    """A trilinear, repeating texture with room for all mip levels, of uint8 or float32. Its content is left over."""
     import moderngl
 
     key = (os.getpid(), width, height, components, {"u": "f1", "f": "f4"}[dtype.kind])
@@ -77,7 +77,7 @@ def _context(process: int) -> moderngl.Context:
         raise DopeError("rendering needs the package moderngl", remedy=remedy) from error
     os.environ.setdefault("LP_NUM_THREADS", "1")
     try:
-        made = moderngl.create_context(standalone=True, backend="egl", require=MIN_VERSION)
+        made: Any = moderngl.create_context(standalone=True, backend="egl", require=MIN_VERSION)  # type: ignore[arg-type]
     except Exception as error:  # what it raises is a bare Exception, of many causes
         remedy = f"On Debian: `apt-get install {PACKAGES}`; or render with --renderer cycles"
         raise DopeError(f"no OpenGL {MIN_VERSION / 100:.1f} through EGL ({error})", remedy=remedy) from error
@@ -85,7 +85,7 @@ def _context(process: int) -> moderngl.Context:
     return made
 
 
-@lru_cache(maxsize=None)
+@cache
 def _program(process: int, name: str, kind: int) -> moderngl.Program:
     vertex = f"{name}.vert.glsl" if (FOLDER / f"{name}.vert.glsl").exists() else "screen.vert.glsl"
     return _context(process).program(

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.geometry import Floats
 from pipeline.render.fast.geometry import linear
@@ -26,6 +25,8 @@ KEY_SAMPLES = 10
 """Directions over the disc of a key light."""
 AMBIENT_SAMPLES = 24
 """Directions over the sphere for the rest."""
+GROUND_SAMPLES = 32
+"""Directions over the upper half for the shadows on the ground, where few would show one by one."""
 DIRECTIONS = KEYS * KEY_SAMPLES + AMBIENT_SAMPLES
 KEY_RADIUS_DEG = (1.5, 16.0)
 """Smallest and largest radius of a key light: the sun's own is less than a shadow map resolves."""
@@ -47,6 +48,8 @@ class Lights:
         key_directions: (KEYS, 3) unit, towards the light.
         directions: (DIRECTIONS, 3) unit: KEY_SAMPLES for each key light, then AMBIENT_SAMPLES.
         weights: (DIRECTIONS,) share of its key light, or power of the smooth light around it; 0: unused.
+        ground_directions: (KEYS * KEY_SAMPLES + GROUND_SAMPLES, 3) those that shade the ground.
+        ground_weights: their shares, (.., KEYS + 1): of the smooth light on level ground, and of each key light.
         bounce: (3,) radiance of the lit ground, 0 without one.
         exposure: (3,) multiplies radiance before tone mapping; with it the white balance.
     """
@@ -56,6 +59,8 @@ class Lights:
     key_directions: Floats
     directions: Floats
     weights: Floats
+    ground_directions: Floats
+    ground_weights: Floats
     bounce: Floats
     exposure: Floats
 
@@ -92,10 +97,20 @@ def lights_of(light: Light, ground: Ground | None) -> Lights:
         radiance[toward[..., 2] <= 0] = bounce
     power = (radiance * angle[..., None]).reshape(-1, 3)
     harmonics = (_COSINE * _NORM * _NORM / np.pi)[:, None] * (basis(toward).reshape(-1, 9).T @ power)
-    samples, weights = _samples(key_directions, radii, toward.reshape(-1, 3), power @ LUMINANCE)
-    weights[: KEYS * KEY_SAMPLES] *= np.repeat(keys.any(axis=1), KEY_SAMPLES)
+    directions, luminance = toward.reshape(-1, 3), power @ LUMINANCE
+    discs, sphere = _discs(key_directions, radii), _sphere()
+    there = np.repeat(keys.any(axis=1), KEY_SAMPLES) / KEY_SAMPLES
+    weights = np.concatenate([there, _around(sphere, directions, luminance)])
+    above = _upper_half()
+    level = _around(above, directions, luminance * np.maximum(directions[:, 2], 0))
+    shares = np.zeros((len(discs) + GROUND_SAMPLES, 1 + KEYS))
+    shares[len(discs) :, 0] = level / max(level.sum(), 1e-12)
+    for key in range(KEYS):
+        chosen = slice(key * KEY_SAMPLES, (key + 1) * KEY_SAMPLES)
+        shares[chosen, 1 + key] = there[chosen]
     exposure = _exposure(_white(harmonics, keys, key_directions), reflects) * (light.strength / USUAL_STRENGTH)
-    return Lights(harmonics, keys, key_directions, samples, weights, bounce, exposure)
+    samples, on_ground = np.concatenate([discs, sphere]), np.concatenate([discs, above])
+    return Lights(harmonics, keys, key_directions, samples, weights, on_ground, shares, bounce, exposure)
 
 
 def _take_key(radiance: Floats, toward: Floats, angle: Floats) -> tuple[Floats, Floats, float] | None:
@@ -124,24 +139,39 @@ def _take_key(radiance: Floats, toward: Floats, angle: Floats) -> tuple[Floats, 
     return colour, direction, float(np.clip(radius, *np.radians(KEY_RADIUS_DEG)))
 
 
-def _samples(keys: Floats, radii: Floats, toward: Floats, power: Floats) -> tuple[Floats, Floats]:
-    """Directions (DIRECTIONS, 3) and their weights: discs of the key lights, then the sphere."""
+_GOLDEN = np.pi * (3 - np.sqrt(5))
+
+
+def _discs(keys: Floats, radii: Floats) -> Floats:
+    """Directions (KEYS * KEY_SAMPLES, 3) over the discs of the key lights."""
     number = np.arange(KEY_SAMPLES) + 0.5
-    golden = np.pi * (3 - np.sqrt(5))
-    radius, around = np.sqrt(number / KEY_SAMPLES), golden * number
-    discs = []
-    for key, size in zip(keys, np.tan(radii), strict=True):
-        across, along = frame_of(key)
-        disc = key + size * radius[:, None] * (np.outer(np.cos(around), across) + np.outer(np.sin(around), along))
-        discs.append(disc / np.linalg.norm(disc, axis=1, keepdims=True))
+    radius, around = np.sqrt(number / KEY_SAMPLES), _GOLDEN * number
+    across, along = frame_of(keys)
+    offsets = np.cos(around)[:, None] * across[:, None] + np.sin(around)[:, None] * along[:, None]
+    discs = keys[:, None] + (np.tan(radii)[:, None] * radius)[..., None] * offsets
+    return (discs / np.linalg.norm(discs, axis=-1, keepdims=True)).reshape(-1, 3)
+
+
+def _sphere() -> Floats:
+    """Directions (AMBIENT_SAMPLES, 3), evenly over the sphere."""
     number = np.arange(AMBIENT_SAMPLES) + 0.5
-    z = 1 - 2 * number / AMBIENT_SAMPLES
+    return _spiral(number, 1 - 2 * number / AMBIENT_SAMPLES)
+
+
+def _upper_half() -> Floats:
+    """Directions (GROUND_SAMPLES, 3) over the upper half, as dense as level ground sees it."""
+    number = np.arange(GROUND_SAMPLES) + 0.5
+    return _spiral(number, np.sqrt(1 - number / GROUND_SAMPLES))
+
+
+def _spiral(number: Floats, z: Floats) -> Floats:
     flat = np.sqrt(1 - z * z)
-    sphere = np.column_stack([flat * np.cos(golden * number), flat * np.sin(golden * number), z])
-    nearest = np.argmax(toward @ sphere.T, axis=1)
-    weights = np.bincount(nearest, power, AMBIENT_SAMPLES)
-    shares = np.full(KEYS * KEY_SAMPLES, 1 / KEY_SAMPLES)
-    return np.concatenate([*discs, sphere]), np.concatenate([shares, weights])
+    return np.column_stack([flat * np.cos(_GOLDEN * number), flat * np.sin(_GOLDEN * number), z])
+
+
+def _around(samples: Floats, toward: Floats, power: Floats) -> Floats:
+    """The power (N,) that comes from around each sample (S, 3): of the directions (N, 3) that it is nearest to."""
+    return np.asarray(np.bincount(np.argmax(toward @ samples.T, axis=1), power, len(samples)), np.float64)
 
 
 def frame_of(directions: Floats) -> tuple[Floats, Floats]:
@@ -163,7 +193,7 @@ def _white(harmonics: Floats, keys: Floats, key_directions: Floats) -> Floats:
 
 
 def _exposure(white: Floats, albedo: float) -> Floats:
-    """What a camera would set: WHITE for a white object, less over a bright ground, and half of the light's hue gone."""
+    """As a camera would: WHITE for a white object, less over a bright ground, and half of the light's hue gone."""
     bright = float(white @ LUMINANCE)
     scale = WHITE / bright * np.clip(USUAL_ALBEDO / max(albedo, 1e-3), 0.2, 5) ** 0.35
     return np.asarray(scale * (bright / white) ** 0.6)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pipeline.geometry import Floats
 from pipeline.render.fast.context import context, give_texture, program, take_texture
 from pipeline.render.fast.geometry import Geometry, linear, occluder_faces
-from pipeline.render.fast.light import AMBIENT_SAMPLES, DIRECTIONS, KEY_SAMPLES, KEYS, Lights, frame_of, lights_of
+from pipeline.render.fast.light import DIRECTIONS, GROUND_SAMPLES, KEY_SAMPLES, KEYS, Lights, frame_of, lights_of
 from pipeline.render.scene import Ground, Scene
 
 TILE = 128
@@ -25,6 +25,7 @@ CAST = 256
 LOWEST_CASTER = 0.12
 """Height of the lowest direction that casts a shadow on the ground."""
 MAX_REACH = 4.0
+CASTERS = KEYS * KEY_SAMPLES + GROUND_SAMPLES
 MAX_COLOURS = 64
 UNITS = {"panorama": 2, "albedo": 3, "slopes": 4, "blocked": 5, "textures": 6, "atlas": 7}
 """Texture units of what a scene has; those of a shot's targets come before."""
@@ -150,15 +151,12 @@ class SceneOnDevice:
         self._textures[UNITS["albedo"]] = self._albedo(ground.albedo)
         if ground.bumps is not None:
             self._textures[UNITS["slopes"]] = self._slopes(ground)
-        shares = np.zeros((DIRECTIONS, 4))
-        for key in range(KEYS):
-            chosen = slice(key * KEY_SAMPLES, (key + 1) * KEY_SAMPLES)
-            shares[chosen, 1 + key] = lights.weights[chosen]
-        smooth, z = slice(DIRECTIONS - AMBIENT_SAMPLES, DIRECTIONS), lights.directions[:, 2]
-        shares[smooth, 0] = lights.weights[smooth] * np.maximum(z[smooth], 0)
-        shares[smooth, 0] /= max(shares[smooth, 0].sum(), 1e-12)
-        reach = shadow_reach(lights.directions[_casters(lights)], geometry, ground.height)
-        self._values |= {"shares": shares, "reach": reach}
+        casters = _casters(lights)
+        toward, shares = (np.zeros((CASTERS, 4)) for _ in range(2))
+        toward[: len(casters), :3] = lights.ground_directions[casters]
+        shares[: len(casters), : 1 + KEYS] = lights.ground_weights[casters]
+        reach = shadow_reach(lights.ground_directions[casters], geometry, ground.height)
+        self._values |= {"caster_toward": toward, "shares": shares, "reach": reach}
 
     # ---- shadows
 
@@ -189,15 +187,14 @@ class SceneOnDevice:
         texture.repeat_x = texture.repeat_y = False
         depth = self._own(ctx.depth_renderbuffer((CAST, CAST)))
         target = self._own(ctx.framebuffer([texture], depth))
-        used = np.flatnonzero(_casters(lights))
-        set_value(program("cast"), "used", _padded(used))
+        count = len(_casters(lights))
         target.use()
         target.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
         ctx.enable_only(moderngl.DEPTH_TEST | moderngl.BLEND)
         ctx.depth_func = "<"
         ctx.blend_func = moderngl.ONE, moderngl.ONE
-        if len(used):
-            mesh.render(moderngl.TRIANGLES, instances=len(used))
+        if count:
+            mesh.render(moderngl.TRIANGLES, instances=count)
         texture.build_mipmaps(0, 2)
         texture.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
         return texture
@@ -216,7 +213,7 @@ class SceneOnDevice:
         """Square roots of linear light in 8 bits: as fine as sRGB, and cheap to undo after the filter."""
         picture = np.ascontiguousarray(picture)
         levels = [cv2.LUT(picture, _ROOTS_OF_SRGB)]
-        light = cv2.LUT(picture, _LINEAR)
+        light: NDArray[Any] = cv2.LUT(picture, _LINEAR)
         while max(light.shape[:2]) > 1:
             light = _halved(light)
             levels.append(np.take(_ROOTS, light >> 4))
@@ -253,7 +250,7 @@ class SceneOnDevice:
         return made
 
     def _levels(self, levels: list[NDArray[Any]]) -> Any:
-        """A texture with the given mip levels, from the process's stock: to make one anew takes longer than to fill it."""
+        """A texture of mip levels, from the process's stock: to make one anew takes longer than to fill it."""
         first = levels[0]
         made = take_texture(first.shape[1], first.shape[0], first.shape[2], first.dtype)
         self._stack.callback(give_texture, made)
@@ -279,11 +276,11 @@ def slopes_of(bumps: NDArray[np.float32], side: float) -> NDArray[np.float32]:
     wide = cv2.copyMakeBorder(bumps, 1, 1, 1, 1, cv2.BORDER_WRAP)
     x = (wide[1:-1, 2:] - wide[1:-1, :-2]) * np.float32(bumps.shape[1] / (2 * side))
     y = (wide[:-2, 1:-1] - wide[2:, 1:-1]) * np.float32(bumps.shape[0] / (2 * side))
-    return cv2.merge([x, y])
+    return np.stack([x, y], axis=-1)
 
 
 def shadow_reach(directions: Floats, geometry: Geometry, height: float) -> float:
-    """Half the side of the square of ground, around the world's origin, that shadows along directions (N, 3) fall on."""
+    """Half the side of the square of ground around the origin that shadows along directions (N, 3) fall on."""
     corners = geometry.corners()
     far = float(np.abs(corners[:, :2]).max())
     if len(directions):
@@ -297,8 +294,9 @@ def _kind(scene: Scene, geometry: Geometry) -> int:
     return {"own": TEXTURED if len(geometry.textures) else 0, "colour": 1, "voronoi": 2}[scene.surface.kind]
 
 
-def _casters(lights: Lights) -> NDArray[np.bool_]:
-    return (lights.directions[:, 2] > LOWEST_CASTER) & (lights.weights > 0)
+def _casters(lights: Lights) -> NDArray[np.intp]:
+    """Which of the ground's directions throw a shadow: the lowest throw them out of sight."""
+    return np.flatnonzero((lights.ground_directions[:, 2] > LOWEST_CASTER) & lights.ground_weights.any(axis=1))
 
 
 def _halved(level: NDArray[Any]) -> NDArray[Any]:
