@@ -12,7 +12,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from render_scenes import (
+
+from dope.common.errors import BadInput, DopeError
+from pipeline.geometry import Camera
+from pipeline.render.config import FastConfig
+from pipeline.render.fast import FastRenderer, context
+from pipeline.render.fast.geometry import geometry_of, linear, occluder_faces
+from pipeline.render.scene import Light, Model, Part, Picture, Scene, Shot, Surface
+from tests.pipeline.fast_scenes import (
     box,
     box_depth,
     camera_at,
@@ -26,13 +33,6 @@ from render_scenes import (
     sphere_depth,
     sunny,
 )
-
-from dope.common.errors import BadInput, DopeError
-from pipeline.geometry import Camera
-from pipeline.render.config import FastConfig
-from pipeline.render.fast import FastRenderer, context
-from pipeline.render.fast.geometry import geometry_of, linear, occluder_faces
-from pipeline.render.scene import Light, Model, Part, Picture, Scene, Shot, Surface
 
 HALF = (0.5, 0.3, 0.2)
 ROOT = Path(__file__).parents[2]
