@@ -44,6 +44,7 @@ class ColmapConfig:
 
 
 COLMAP_STAGES = ("frames", "sfm", "depth")
+RENDERS_A_PROCESS = 100
 
 
 def prepare(
@@ -95,7 +96,15 @@ def correspond_all(
     for sequence in sequences:
         plan = {"correspond": stages.fingerprint("correspond", config, _marks(sequence, "depth", "masks"))}
         tasks.append(Task(sequence.folder, ("correspond",), plan, correspond_one, (config,)))
-    return run_tasks(tasks, options, watcher or Unwatched())
+    short = all(map(_is_render, sequences))  # a process takes as long to start as one of them
+    return run_tasks(tasks, options, watcher or Unwatched(), reuse=RENDERS_A_PROCESS if short else 1)
+
+
+def _is_render(sequence: Sequence) -> bool:
+    try:
+        return sequence.read_info().kind == "render"
+    except BadInput:
+        return False
 
 
 def other_input(sequence: Sequence, source: Source) -> str | None:

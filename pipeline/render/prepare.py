@@ -22,6 +22,7 @@ from pipeline import stages
 from pipeline.children import Notify
 from pipeline.geometry import Camera
 from pipeline.masks.mask_io import write_masks
+from pipeline.prepare import RENDERS_A_PROCESS
 from pipeline.render.cameras import paired_cameras
 from pipeline.render.check import seen_by_both
 from pipeline.render.config import CyclesConfig, FastConfig, RenderConfig
@@ -32,7 +33,6 @@ from pipeline.stages import StageResult, run_stage
 from pipeline.tasks import RunOptions, Task, Unwatched, Watcher, run_tasks
 
 RENDER_STAGES = ("frames", "sfm", "depth")
-OBJECTS_A_PROCESS = 100
 GROUND_KEPT = 1.5
 """Depth is kept up to so many times the object's largest."""
 POINTS_A_PAIR = 60
@@ -95,7 +95,7 @@ def prepare_renders(
         except BadInput as error:
             refusal = str(error)
         tasks.append(Task(folder, RENDER_STAGES, plan, _render_one, (source, inputs, config), refusal))
-    return run_tasks(tasks, options, watcher or Unwatched(), reuse=OBJECTS_A_PROCESS)
+    return run_tasks(tasks, options, watcher or Unwatched(), reuse=RENDERS_A_PROCESS)
 
 
 def _settled(config: RenderConfig) -> RenderConfig:
