@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
 from dope.common.errors import DiskFull, DopeError
 from pipeline import stages
-from pipeline.children import ChildFailed, Children, ChildStopped, Limits, run_in_child
+from pipeline.children import ChildFailed, Children, ChildStopped, Limits, Notify, run_in_child
 from pipeline.engines import holding, run_items
 from pipeline.refused import refused
 from pipeline.sequence import Sequence
@@ -82,8 +81,12 @@ def run_tasks(tasks: list[Task], options: RunOptions, watcher: Watcher, *, reuse
         watcher.finished(task.folder.name, rows)
         return rows
 
+    def in_its_own(*args: Any, notify: Notify) -> list[StageResult]:
+        rows: list[StageResult] = run_in_child(*args, limits=options.limits, notify=notify)
+        return rows
+
     with Children(options.limits, reuse=reuse) as children:
-        call = children.call if reuse > 1 else partial(run_in_child, limits=options.limits)
+        call = children.call if reuse > 1 else in_its_own
         results = run_items(tasks, one, workers=options.workers)
     return [row for rows in results for row in rows]
 
