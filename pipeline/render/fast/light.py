@@ -17,15 +17,15 @@ from pipeline.render.fast.geometry import linear
 from pipeline.render.scene import Ground, Light
 from pipeline.render.skies import directions_of
 
-ROWS = 64
+ROWS = 48
 """Rows of the panorama that lights are looked for in."""
 KEYS = 2
 """Key lights at most."""
-KEY_SAMPLES = 10
+KEY_SAMPLES = 8
 """Directions over the disc of a key light."""
-AMBIENT_SAMPLES = 24
+AMBIENT_SAMPLES = 18
 """Directions over the sphere for the rest."""
-GROUND_SAMPLES = 32
+GROUND_SAMPLES = 24
 """Directions over the upper half for the shadows on the ground, where few would show one by one."""
 DIRECTIONS = KEYS * KEY_SAMPLES + AMBIENT_SAMPLES
 KEY_RADIUS_DEG = (1.5, 16.0)

@@ -2,8 +2,8 @@
 // KIND: 0 colours of parts and vertices, 1 one colour, 2 Voronoi cells, 3 as 0 with textures.
 #include "common.glsl"
 #include "hit.glsl"
-const int KEY_SAMPLES = 10;
-const int DIRECTIONS = 44;
+const int KEY_SAMPLES = 8;
+const int DIRECTIONS = 34;
 layout(std430, binding = 2) readonly buffer Colours { uint colours[]; };
 layout(std430, binding = 3) readonly buffer Materials { vec4 materials[]; };  // linear colour, texture or -1
 

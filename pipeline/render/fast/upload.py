@@ -20,7 +20,7 @@ TILE = 128
 TILES = (8, -(-DIRECTIONS // 8))
 GUTTER = 1.0 - 4.0 / TILE
 """Share of a tile that the object's ball fills, so that no tile's filter reads its neighbour."""
-CAST = 256
+CAST = 192
 """Side of the picture of shadows on the ground."""
 LOWEST_CASTER = 0.12
 """Height of the lowest direction that casts a shadow on the ground."""
@@ -261,9 +261,9 @@ class SceneOnDevice:
 
 def set_value(target: Any, key: str, value: Any) -> None:
     """Set a uniform that a program has; arrays as float32 unless they are integers. Others are passed over."""
-    if key not in target:
+    uniform = target.get(key, None)  # `in` would go through all names
+    if uniform is None:
         return
-    uniform = target[key]
     if isinstance(value, np.ndarray):
         data = np.ascontiguousarray(value, None if value.dtype.kind == "i" else np.float32).tobytes()
         uniform.write(data[: 4 * uniform.array_length * uniform.dimension])  # a compiler drops ends that are not read
