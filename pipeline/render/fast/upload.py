@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry import Floats
-from pipeline.render.fast.context import context, give_texture, program, take_texture
+from pipeline.render.fast.context import MAX_COLOURS, context, give_texture, program, take_texture
 from pipeline.render.fast.geometry import Geometry, linear, occluder_faces
-from pipeline.render.fast.light import DIRECTIONS, GROUND_SAMPLES, KEY_SAMPLES, KEYS, Lights, frame_of, lights_of
+from pipeline.render.fast.light import CASTERS, DIRECTIONS, KEYS, Lights, frame_of, lights_of
 from pipeline.render.scene import Ground, Scene
 
 TILE = 128
@@ -25,8 +25,6 @@ CAST = 192
 LOWEST_CASTER = 0.12
 """Height of the lowest direction that casts a shadow on the ground."""
 MAX_REACH = 4.0
-CASTERS = KEYS * KEY_SAMPLES + GROUND_SAMPLES
-MAX_COLOURS = 64
 UNITS = {"panorama": 2, "albedo": 3, "slopes": 4, "blocked": 5, "textures": 6, "atlas": 7}
 """Texture units of what a scene has; those of a shot's targets come before."""
 SCREENS = ("sky", "ground", "object", "depth", "resolve")
