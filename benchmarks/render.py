@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -91,22 +92,17 @@ def scene_of(part: Part, number: int, views: int = VIEWS) -> Scene:
     return Scene(Model((part,)), surface, ground, light, tuple(shots), number)
 
 
-def cpu_seconds() -> float:
-    times = os.times()
-    return times.user + times.system
-
-
 def resident_mb() -> float:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def timed(renderer: FastRenderer, scene: Scene) -> tuple[float, float]:
     """CPU seconds of a scene before its first view, and of a view."""
-    start = cpu_seconds()
+    start = time.process_time()
     list(renderer.render(Scene(scene.model, scene.surface, scene.ground, scene.light, scene.shots[:1], scene.seed)))
-    one = cpu_seconds()
+    one = time.process_time()
     list(renderer.render(scene))
-    view = (cpu_seconds() - one - (one - start)) / (len(scene.shots) - 1)
+    view = (time.process_time() - one - (one - start)) / (len(scene.shots) - 1)
     return one - start - view, view
 
 
@@ -163,7 +159,7 @@ def main() -> None:
     given = parser.parse_args()
     cv2.setNumThreads(1)
     parts = [load(path) for path in find_meshes(given.meshes, given.count)] if given.meshes else []
-    start = cpu_seconds()
+    start = time.process_time()
     for number in range(KINDS):
         sky(number), ground_material(number)
     if given.sheet:
@@ -172,7 +168,7 @@ def main() -> None:
     renderer = FastRenderer(FastConfig(supersample=2))
     list(renderer.render(scene_of(bumpy_ball(200), 0, 1)))
     renderer.close()
-    say("first_use_s", round(cpu_seconds() - start, 2), panoramas=KINDS, floors=KINDS)
+    say("first_use_s", round(time.process_time() - start, 2), panoramas=KINDS, floors=KINDS)
     real = [scene_of(part, number) for number, part in enumerate(parts)]
     for supersample in (1, 2):
         if real:

@@ -1,7 +1,6 @@
 #version 430
 // The object's shadows on the ground, one instance a direction. Every instance has a depth of its own, nearer than
 // those before it: by the depth test a texel counts each direction once, however many faces shade it.
-const int CASTERS = 52;
 uniform vec4 caster_toward[CASTERS];
 uniform vec4 shares[CASTERS];  // of the smooth light, of the first and of the second key light
 uniform float height;

@@ -1,5 +1,4 @@
 // Camera, light and tone mapping: what all passes over pixels share.
-const int KEYS = 2;
 const float PI = 3.14159265358979;
 
 uniform mat3 world_from_pixel;  // pixel (x, y, 1) to the ray's direction whose z-depth is 1

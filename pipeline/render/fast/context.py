@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dope.common.errors import DopeError
+from pipeline.render.fast import light
 
 if TYPE_CHECKING:
     import moderngl
@@ -18,6 +19,15 @@ if TYPE_CHECKING:
 MIN_VERSION = 430  # storage buffers
 PACKAGES = "libegl1 libgl1-mesa-dri"
 FOLDER = Path(__file__).parent
+MAX_COLOURS = 64
+CONSTANTS = {
+    "KEYS": light.KEYS,
+    "KEY_SAMPLES": light.KEY_SAMPLES,
+    "DIRECTIONS": light.DIRECTIONS,
+    "CASTERS": light.CASTERS,
+    "MAX_COLOURS": MAX_COLOURS,
+}
+"""Macros of every shader."""
 
 
 def context() -> moderngl.Context:
@@ -94,7 +104,8 @@ def _program(process: int, name: str, kind: int) -> moderngl.Program:
 
 
 def _source(name: str, kind: int) -> str:
-    """A shader with its `#include`s and the macro KIND."""
+    """A shader with its `#include`s and macros."""
     text = (FOLDER / name).read_text(encoding="utf-8")
     text = re.sub(r'#include "(.+)"', lambda found: _source(found[1], kind), text)
-    return re.sub(r"^#version .*$", rf"\g<0>\n#define KIND {kind}", text, count=1, flags=re.MULTILINE)
+    given = "\n".join(f"#define {key} {value}" for key, value in (CONSTANTS | {"KIND": kind}).items())
+    return re.sub(r"^#version .*$", rf"\g<0>\n{given}", text, count=1, flags=re.MULTILINE)

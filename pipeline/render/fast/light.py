@@ -17,17 +17,18 @@ from pipeline.render.fast.geometry import linear
 from pipeline.render.scene import Ground, Light
 from pipeline.render.skies import directions_of
 
-ROWS = 64
+ROWS = 48
 """Rows of the panorama that lights are looked for in."""
 KEYS = 2
 """Key lights at most."""
-KEY_SAMPLES = 10
+KEY_SAMPLES = 8
 """Directions over the disc of a key light."""
-AMBIENT_SAMPLES = 24
+AMBIENT_SAMPLES = 18
 """Directions over the sphere for the rest."""
-GROUND_SAMPLES = 32
+GROUND_SAMPLES = 24
 """Directions over the upper half for the shadows on the ground, where few would show one by one."""
 DIRECTIONS = KEYS * KEY_SAMPLES + AMBIENT_SAMPLES
+CASTERS = KEYS * KEY_SAMPLES + GROUND_SAMPLES
 KEY_RADIUS_DEG = (1.5, 16.0)
 """Smallest and largest radius of a key light: the sun's own is less than a shadow map resolves."""
 KEY_REACH_DEG = 24.0
@@ -48,8 +49,8 @@ class Lights:
         key_directions: (KEYS, 3) unit, towards the light.
         directions: (DIRECTIONS, 3) unit: KEY_SAMPLES for each key light, then AMBIENT_SAMPLES.
         weights: (DIRECTIONS,) share of its key light, or power of the smooth light around it; 0: unused.
-        ground_directions: (KEYS * KEY_SAMPLES + GROUND_SAMPLES, 3) those that shade the ground.
-        ground_weights: their shares, (.., KEYS + 1): of the smooth light on level ground, and of each key light.
+        ground_directions: (CASTERS, 3) those that shade the ground.
+        ground_weights: their shares, (CASTERS, KEYS + 1): of the smooth light on level ground, and of each key light.
         bounce: (3,) radiance of the lit ground, 0 without one.
         exposure: (3,) multiplies radiance before tone mapping; with it the white balance.
     """

@@ -2,8 +2,6 @@
 // KIND: 0 colours of parts and vertices, 1 one colour, 2 Voronoi cells, 3 as 0 with textures.
 #include "common.glsl"
 #include "hit.glsl"
-const int KEY_SAMPLES = 10;
-const int DIRECTIONS = 44;
 layout(std430, binding = 2) readonly buffer Colours { uint colours[]; };
 layout(std430, binding = 3) readonly buffer Materials { vec4 materials[]; };  // linear colour, texture or -1
 
@@ -11,7 +9,7 @@ uniform sampler2D seen;
 uniform sampler2DArray textures;
 uniform sampler2DShadow atlas;
 uniform vec3 forward;
-uniform vec3 palette[64];
+uniform vec3 palette[MAX_COLOURS];
 uniform int n_colours;
 uniform float cells;
 uniform uint seed;

@@ -1,6 +1,5 @@
 #version 430
 // Depth of the object seen along every direction, each in its tile of an atlas: one instance a direction.
-const int DIRECTIONS = 44;
 uniform vec4 across[DIRECTIONS];  // row of the matrix that maps a point to the tile's x in [-1, 1]
 uniform vec4 along[DIRECTIONS];
 uniform vec4 toward[DIRECTIONS];

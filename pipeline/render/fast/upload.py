@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry import Floats
-from pipeline.render.fast.context import context, give_texture, program, take_texture
+from pipeline.render.fast.context import MAX_COLOURS, context, give_texture, program, take_texture
 from pipeline.render.fast.geometry import Geometry, linear, occluder_faces
-from pipeline.render.fast.light import DIRECTIONS, GROUND_SAMPLES, KEY_SAMPLES, KEYS, Lights, frame_of, lights_of
+from pipeline.render.fast.light import CASTERS, DIRECTIONS, KEYS, Lights, frame_of, lights_of
 from pipeline.render.scene import Ground, Scene
 
 TILE = 128
@@ -20,13 +20,11 @@ TILE = 128
 TILES = (8, -(-DIRECTIONS // 8))
 GUTTER = 1.0 - 4.0 / TILE
 """Share of a tile that the object's ball fills, so that no tile's filter reads its neighbour."""
-CAST = 256
+CAST = 192
 """Side of the picture of shadows on the ground."""
 LOWEST_CASTER = 0.12
 """Height of the lowest direction that casts a shadow on the ground."""
 MAX_REACH = 4.0
-CASTERS = KEYS * KEY_SAMPLES + GROUND_SAMPLES
-MAX_COLOURS = 64
 UNITS = {"panorama": 2, "albedo": 3, "slopes": 4, "blocked": 5, "textures": 6, "atlas": 7}
 """Texture units of what a scene has; those of a shot's targets come before."""
 SCREENS = ("sky", "ground", "object", "depth", "resolve")
@@ -261,9 +259,9 @@ class SceneOnDevice:
 
 def set_value(target: Any, key: str, value: Any) -> None:
     """Set a uniform that a program has; arrays as float32 unless they are integers. Others are passed over."""
-    if key not in target:
+    uniform = target.get(key, None)  # `in` would go through all names
+    if uniform is None:
         return
-    uniform = target[key]
     if isinstance(value, np.ndarray):
         data = np.ascontiguousarray(value, None if value.dtype.kind == "i" else np.float32).tobytes()
         uniform.write(data[: 4 * uniform.array_length * uniform.dimension])  # a compiler drops ends that are not read
