@@ -93,7 +93,7 @@ class MeshConfig:
     """The axis of the file that points up; "auto": y in glTF and ShapeNet, z elsewhere."""
     pose: Literal["stable", "upright"] = "stable"
     """"stable": as it would come to rest on the plane, drawn by how probable that is; "upright": as in the file."""
-    min_mask_share: float = 0.005
+    min_mask_share: float = 0.002
     """Pairs of which a view shows less of the object are dropped."""
 
     def __post_init__(self) -> None:
