@@ -34,10 +34,10 @@ class Plan:
     ways: int
     queries: int
     renders: int
-    """Procedural CAD-like objects to train on as well, rendered with exact depth instead of filmed."""
+    """Procedural CAD-like objects, rendered instead of filmed: what the network makes of things of another kind."""
 
 
-FULL = Plan(DemoConfig(), train=(), episodes=1000, ways=4, queries=2, renders=12)
+FULL = Plan(DemoConfig(), train=(), episodes=1000, ways=4, queries=2, renders=6)
 TINY = Plan(
     DemoConfig(
         per_family=2,
@@ -95,23 +95,23 @@ def run_demo(out: Path, *, workers: int = 0, tiny: bool = False) -> None:
              *base, *("--set", f"frames.count={plan.films.film.frames}"), allow_failed_items=True)  # fmt: skip
         dope("prep", "masks", work, *base, allow_failed_items=True)
         dope("prep", "correspond", work, "--every", 1, *base, allow_failed_items=True)
-        works, holdout = [work], ("--holdout", "none")
-        if part == "train":
-            holdout = ("--holdout", "frames")
-            if (reason := _cannot_render()) is None:
-                works.append(out / "work-renders")
-                dope("prep", "render", "--recipe", "procedural", "--count", plan.renders, "--out", works[1], *base)
-                dope("prep", "correspond", works[1], *base, allow_failed_items=True)
-            else:
-                say(f"[yellow]no renders of procedural objects: {escape(reason)}[/]")
-        dope("prep", "shards", *works, "--out", out / f"shards-{part}", *holdout, allow_failed_items=True)
+        holdout = ("--holdout", "frames") if part == "train" else ("--holdout", "none")
+        dope("prep", "shards", work, "--out", out / f"shards-{part}", *holdout, allow_failed_items=True)
+    if (reason := _cannot_render()) is None:
+        work = out / "work-renders"
+        dope("prep", "render", "--recipe", "procedural", "--count", plan.renders, "--out", work, *base,
+             allow_failed_items=True)  # fmt: skip
+        dope("prep", "correspond", work, *base, allow_failed_items=True)
+        dope("prep", "shards", work, "--out", out / "shards-renders", "--holdout", "none", allow_failed_items=True)
+    else:
+        say(f"[yellow]no renders of procedural objects: {escape(reason)}[/]")
 
     run, shards, novel = out / "run", out / "shards-train", out / "shards-novel"
     settings = [word for setting in plan.train for word in ("--set", setting)]
     dope("train", shards, "--out", run, "--preset", "nano", *settings)
     dope("eval", run, novel, "--ways", plan.ways, "--shots", 1, "--queries", plan.queries,
          "--episodes", plan.episodes, "--compare-untrained")  # fmt: skip
-    for dataset in (shards, novel):
+    for dataset in (shards, novel, *([] if reason else [out / "shards-renders"])):
         shown = [word for name in _one_of_each_family(dataset) for word in ("--sequence", name)]
         for kind in ("colouring", "heatmap"):
             dope("figure", run, dataset, "--kind", kind, *shown, "--masks", "given", "--out", out / "figures")
