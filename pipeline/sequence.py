@@ -143,6 +143,8 @@ class SequenceInfo:
     """True where neighbouring frames are neighbouring views (videos, turntables)."""
     paired: bool = False
     """True where frames 2k and 2k + 1 were made to be a pair (renders)."""
+    subset: str | None = None
+    """The part of its dataset that it comes from (ModelNet's train or test), as the source says; nothing reads it."""
     n_frames: int = 0
     n_registered: int = 0
     registered_share: float = 0.0

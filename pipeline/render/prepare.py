@@ -19,7 +19,7 @@ import numpy as np
 from dope.common import files
 from dope.common.errors import BadInput
 from pipeline import stages
-from pipeline.children import Notify
+from pipeline.children import Notify, run_in_child
 from pipeline.geometry import Camera
 from pipeline.masks.mask_io import write_masks
 from pipeline.prepare import RENDERS_A_PROCESS
@@ -30,7 +30,7 @@ from pipeline.render.find import RenderSource, mesh_fingerprint
 from pipeline.render.scene import Picture, Renderer, Scene
 from pipeline.sequence import Frame, Sequence, SequenceInfo, write_image
 from pipeline.stages import StageResult, run_stage
-from pipeline.tasks import RunOptions, Task, Unwatched, Watcher, run_tasks
+from pipeline.tasks import RunOptions, Task, Unwatched, Watcher, already_done, run_tasks
 
 RENDER_STAGES = ("frames", "sfm", "depth")
 GROUND_KEPT = 1.5
@@ -81,6 +81,7 @@ def prepare_renders(
 
     Raises:
         BadInput: a folder of panoramas or materials that holds none.
+        DopeError: the renderer is not installed, or cannot be started.
         DiskFull: the disk is full; finished stages keep their results.
     """
     given = _folders(config)
@@ -95,7 +96,18 @@ def prepare_renders(
         except BadInput as error:
             refusal = str(error)
         tasks.append(Task(folder, RENDER_STAGES, plan, _render_one, (source, inputs, config), refusal))
+    if any(task.refusal is None and already_done(task, options) is None for task in tasks):
+        _require_renderer(config, options)
     return run_tasks(tasks, options, watcher or Unwatched(), reuse=RENDERS_A_PROCESS)
+
+
+def _require_renderer(config: RenderConfig, options: RunOptions) -> None:
+    """Start the renderer once, in a process of its own: where it is missing, that is one error, not one an object."""
+    run_in_child(_start_renderer, config, limits=options.limits)
+
+
+def _start_renderer(config: RenderConfig, notify: Notify) -> None:
+    _renderer(config).close()
 
 
 def _settled(config: RenderConfig) -> RenderConfig:
@@ -199,7 +211,7 @@ def render_frames(source: ObjectSource, sequence: Sequence, config: RenderConfig
         sequence.write_depth(row, np.where(depth <= GROUND_KEPT * depth[mask].max(), depth, 0))
     sequence.write_frames(rows)
     info = SequenceInfo(source.id, str(source.path), "render", source.category, source.instance)
-    info.paired, info.n_frames, info.masks_from = True, len(kept), "input"
+    info.subset, info.paired, info.n_frames, info.masks_from = source.subset, True, len(kept), "input"
     sequence.write_info(info)
     details = {
         "frames": len(rows),

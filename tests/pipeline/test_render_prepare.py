@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from dope.common import settings
-from dope.common.errors import BadInput, UsageError
+from dope.common.errors import BadInput, DopeError, UsageError
 from pipeline.cameras.colmap import read_points
 from pipeline.commands.render import _limited
 from pipeline.correspond.match import CorrespondConfig
@@ -41,6 +41,7 @@ f 4 3 2 1\nf 5 6 7 8\nf 1 2 6 5\nf 2 3 7 6\nf 3 4 8 7\nf 4 1 5 8\n"""
 def spheres_in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pipeline.tasks.run_in_child", lambda run, *args, limits, notify: run(*args, notify))
     monkeypatch.setattr("pipeline.children.Children.call", lambda self, run, *args, notify: run(*args, notify))
+    monkeypatch.setattr(prepare, "run_in_child", lambda run, *args, limits: run(*args, None))
     monkeypatch.setattr(prepare, "_renderer", lambda config: SphereRenderer())
 
 
@@ -49,6 +50,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sequence]:
     work = tmp_path_factory.mktemp("work")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pipeline.children.Children.call", lambda self, run, *args, notify: run(*args, notify))
+        patch.setattr(prepare, "run_in_child", lambda run, *args, limits: run(*args, None))
         patch.setattr(prepare, "_renderer", lambda config: SphereRenderer())
         rows = prepare_renders([SOURCE], work, CONFIG, RunOptions())
     assert [(row.stage, row.status) for row in rows] == [("frames", "ok"), ("sfm", "ok"), ("depth", "ok")], rows
@@ -183,6 +185,20 @@ def test_another_mesh_of_the_same_name_does_not_take_its_place(tmp_path: Path) -
         row, *_ = prepare_renders(sources, tmp_path / "work", CONFIG, RunOptions())
         assert row.status == status
     assert "holds the sequence of" in str(row.reason)
+
+
+def test_a_renderer_that_is_not_there_is_one_error_before_anything_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def missing(config: RenderConfig) -> None:
+        raise DopeError("there is no OpenGL", remedy="Install it")
+
+    prepare_renders([SOURCE], tmp_path / "done", CONFIG, RunOptions())
+    monkeypatch.setattr(prepare, "_renderer", missing)
+    with pytest.raises(DopeError, match=r"no OpenGL\. Install it"):
+        prepare_renders([SOURCE, ProceduralSource(1, 0)], tmp_path / "new", CONFIG, RunOptions())
+    assert not (tmp_path / "new").exists()
+    assert all(row.skipped for row in prepare_renders([SOURCE], tmp_path / "done", CONFIG, RunOptions()))
 
 
 @pytest.mark.parametrize("name", ["hdris", "materials"])
