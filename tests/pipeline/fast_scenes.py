@@ -6,9 +6,13 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 
+from dope.common.errors import DopeError
 from pipeline.geometry import Camera
-from pipeline.render.scene import Ground, Light, Model, Part, Scene, Shot, Surface
+from pipeline.render.config import FastConfig
+from pipeline.render.fast import FastRenderer
+from pipeline.render.scene import Ground, Light, Model, Part, Picture, Scene, Shot, Surface
 
 
 def camera_at(
@@ -106,3 +110,15 @@ def sphere_depth(camera: Camera, radius: float) -> np.ndarray:
     a, b, c = (d * d).sum(-1), d @ o, o @ o - radius**2
     root = b * b - a * c
     return np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, 0)
+
+
+def make(supersample: int = 1) -> FastRenderer:
+    try:
+        return FastRenderer(FastConfig(supersample=supersample))
+    except DopeError as error:
+        pytest.skip(f"no OpenGL here: {error}")
+
+
+def one(renderer: FastRenderer, given: Scene) -> Picture:
+    (picture,) = renderer.render(given)
+    return picture
