@@ -57,6 +57,7 @@ REQUIRED = (
     ("typer", "typer"),
     ("rich", "rich"),
     ("tensorboard", "tensorboard"),
+    ("scikit-learn", "sklearn"),
 )
 
 OPTIONAL = (
@@ -75,6 +76,7 @@ OPTIONAL = (
     ),
     ("OpenEXR", "OpenEXR", "depth maps in EXR files", "pip install 'dope-descriptors[exr]'"),
     ("Weights & Biases", "wandb", "--set log.wandb=PROJECT of dope train", "pip install 'dope-descriptors[wandb]'"),
+    ("matplotlib", "matplotlib", "plots of `dope results`", "pip install 'dope-descriptors[plot]'"),
     ("s3fs", "s3fs", "shards in s3://", "pip install '.[s3]'"),
     ("gcsfs", "gcsfs", "shards in gs://", "pip install '.[gs]'"),
     ("huggingface_hub", "huggingface_hub", "shards in hf://", "pip install '.[hf]'"),

@@ -14,7 +14,7 @@ import pytest
 import torch
 from tiny_shards import write_shards
 
-from dope import commands
+from dope.commands import options
 from dope.checkpoints import list_checkpoints, load_network, read_checkpoint
 from dope.common.errors import UsageError
 from dope.config import load_config
@@ -232,9 +232,9 @@ def test_devices() -> None:
         with pytest.raises(UsageError, match=r"there is no cuda:0: PyTorch sees 0 GPUs.*--set device=cpu"):
             pick_device("cuda")
         with pytest.raises(UsageError, match=r"^--device: there is no cuda:0.*--device cpu"):
-            commands._device("cuda")
+            options.device_name("cuda")
     with pytest.raises(UsageError, match=r"^--device: 'gpu7' is no device"):
-        commands._device("gpu7")
+        options.device_name("gpu7")
 
 
 def test_one_process_needs_no_group() -> None:
