@@ -18,7 +18,6 @@ from many_ranks import part
 from tiny_runs import TINY, losses_of, tiny
 from tiny_shards import write_shards
 
-from dope import trainer
 from dope.augmentation import Share, no_augmentation
 from dope.batch import PairBatch
 from dope.checkpoints import list_checkpoints, load_network
