@@ -27,7 +27,7 @@ from pipeline.render.cameras import paired_cameras
 from pipeline.render.check import seen_by_both
 from pipeline.render.config import CyclesConfig, FastConfig, RenderConfig
 from pipeline.render.find import RenderSource, mesh_fingerprint
-from pipeline.render.scene import Picture, Renderer, Scene
+from pipeline.render.scene import RENDERER_VERSIONS, Picture, Renderer, Scene
 from pipeline.sequence import Frame, Sequence, SequenceInfo, write_image
 from pipeline.stages import StageResult, run_stage
 from pipeline.tasks import RunOptions, Task, Unwatched, Watcher, already_done, run_tasks
@@ -84,7 +84,7 @@ def prepare_renders(
         DopeError: the renderer is not installed, or cannot be started.
         DiskFull: the disk is full; finished stages keep their results.
     """
-    given = _folders(config)
+    given = {"renderer_version": RENDERER_VERSIONS[config.renderer], **_folders(config)}
     settled = _settled(config)
     tasks = []
     for source in sources:

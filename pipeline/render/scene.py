@@ -159,11 +159,15 @@ class Picture:
     depth: NDArray[np.float32]
 
 
+RENDERER_VERSIONS = {"fast": 1, "cycles": 2}
+"""Raised by hand when a renderer's pictures of the same scene change; part of the fingerprint of what it made."""
+
+
 class Renderer(Protocol):
     """Makes pictures: a function of the scene and of the renderer's settings, whatever was rendered before."""
 
     version: str
-    """Part of the fingerprint of what it made: the program and its version."""
+    """The renderer, `RENDERER_VERSIONS` of it and what program it uses, as the details of the stage `frames` say."""
 
     def render(self, scene: Scene) -> Iterator[Picture]:
         """A picture for each shot, in order. Raises BadInput where the scene cannot be rendered."""

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.render.exposure import to_linear as linear
 from pipeline.render.fast import FastRenderer
-from pipeline.render.fast.geometry import linear
 from pipeline.render.scene import Light, Part, Shot, Surface
 from tests.pipeline.fast_scenes import (
     box,

@@ -26,7 +26,7 @@ from pipeline.render.cameras import paired_cameras
 from pipeline.render.config import CyclesConfig, FastConfig, RenderConfig, ViewpointsConfig
 from pipeline.render.find import find_meshes
 from pipeline.render.prepare import ProceduralSource, prepare_renders
-from pipeline.render.scene import Picture, Scene
+from pipeline.render.scene import RENDERER_VERSIONS, Picture, Scene
 from pipeline.sequence import Sequence
 from pipeline.tasks import RunOptions
 from tests.pipeline.analytic import SphereRenderer
@@ -141,6 +141,16 @@ def test_only_settings_that_matter_make_it_anew(tmp_path: Path) -> None:
     assert not skipped(replace(CONFIG, seed=1))
     assert not skipped(replace(CONFIG, viewpoints=ViewpointsConfig(pairs=2)))
     assert len(Sequence(tmp_path / SOURCE.id).read_frames()) == 4
+
+
+def test_pictures_of_an_older_version_of_the_renderer_are_made_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert all(row.ok and not row.skipped for row in prepare_renders([SOURCE], tmp_path, CONFIG, RunOptions()))
+    monkeypatch.setitem(RENDERER_VERSIONS, "cycles", 99)
+    assert all(row.skipped for row in prepare_renders([SOURCE], tmp_path, CONFIG, RunOptions()))
+    monkeypatch.setitem(RENDERER_VERSIONS, "fast", 99)
+    assert all(row.ok and not row.skipped for row in prepare_renders([SOURCE], tmp_path, CONFIG, RunOptions()))
 
 
 def test_a_run_that_is_killed_between_stages_ends_with_the_same_bytes(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dope.common.errors import BadInput
+from pipeline.render.exposure import to_linear
 from pipeline.render.scene import Model, Part
 
 GREY = 0.6  # sRGB, of parts that say nothing of how they look
@@ -65,7 +66,7 @@ def geometry_of(model: Model) -> Geometry:
     textured = [number for number, part in enumerate(parts) if part.texture is not None and part.uv is not None]
     materials = np.full((len(parts), 4), -1, np.float32)
     for number, part in enumerate(parts):
-        materials[number, :3] = linear(_base_colour(part))
+        materials[number, :3] = to_linear(_base_colour(part))
     materials[textured, 3] = np.arange(len(textured))
     colours = np.concatenate([_colours(part) for part in parts])
     points = vertices[:, :3].astype(np.float64)
@@ -105,11 +106,6 @@ def _clustered(geometry: Geometry, cells: int) -> NDArray[np.uint32]:
     kept = [np.unique(order, return_index=True)[1] for order in (ends, ends[::-1])]
     both = np.unique(np.concatenate([lines[kept[0]], lines[::-1][kept[1]]]))
     return np.concatenate([first[corners[np.sort(solid)]].astype(np.uint32), faces[both]])
-
-
-def linear(srgb: NDArray[np.floating]) -> NDArray[np.floating]:
-    """sRGB in [0, 1] to linear light (IEC 61966-2-1)."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((np.maximum(srgb, 0) + 0.055) / 1.055) ** 2.4)
 
 
 def _vertices(part: Part) -> NDArray[np.float32]:
