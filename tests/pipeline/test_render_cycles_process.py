@@ -291,3 +291,17 @@ def test_exr_files_that_are_something_else_are_refused(tmp_path: Path) -> None:
         path.write_bytes(whole[:end])
         with pytest.raises(ValueError):
             read_exr(path)
+
+
+def test_blender_takes_no_more_memory_than_its_parent_may() -> None:
+    """Only root may raise a limit: who asks for less than Blender's own gets that, and no error."""
+    lines = [
+        "import os, resource, sys",
+        f"sys.path.insert(0, {str(process.WORKER.parent)!r})",
+        "import worker",
+        "resource.setrlimit(resource.RLIMIT_DATA, (2 << 30, 2 << 30))",
+        "worker.limit_process(os.getppid(), 8 << 30)",
+        "print(resource.getrlimit(resource.RLIMIT_DATA)[0] >> 30)",
+    ]
+    said = subprocess.run([sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True, check=True)
+    assert said.stdout == "2\n"
