@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from pipeline.render.cycles.process import VARIABLE
 from pipeline.render.cycles.renderer import CyclesRenderer
 from pipeline.render.exposure import LUMINANCE, WHITE, Exposure, expose, show, to_linear, to_srgb, white_under
 from pipeline.render.fast.light import lights_of
-from pipeline.render.scene import Ground, Light, Surface
+from pipeline.render.scene import Ground, Light, Part, Picture, Renderer, Scene, Surface
 from tests.pipeline.fast_scenes import make
 from tests.pipeline.render_scenes import even_light, ground, look_at, small_scene, sphere
 
@@ -63,22 +64,37 @@ def test_what_the_rasteriser_simplifies_of_light_hardly_changes_its_exposure(num
         assert 0.93 < ratio < 1.03
 
 
-@pytest.mark.skipif(not os.environ.get(VARIABLE), reason=f"needs an interpreter with bpy, named by ${VARIABLE}")
-def test_the_same_scene_is_as_bright_by_both_renderers() -> None:
-    fast, blender = make(), CyclesRenderer(CyclesConfig(samples=16))
+@pytest.fixture
+def renderers() -> Iterator[tuple[Renderer, Renderer]]:
+    if not os.environ.get(VARIABLE):
+        pytest.skip(f"needs an interpreter with bpy, named by ${VARIABLE}")
+    blender = CyclesRenderer(CyclesConfig(samples=16))
+    yield make(), blender
+    blender.close()
+
+
+def mean_light(pictures: Iterable[Picture], *, of_object: bool = True) -> float:
+    shown = [to_linear(picture.image[picture.mask == of_object] / 255.0) for picture in pictures]
+    return float(np.concatenate(shown).mean())
+
+
+def test_the_same_scene_is_as_bright_by_both_renderers(renderers: tuple[Renderer, Renderer]) -> None:
     cameras = look_at(0.3, 1.0, 2.0, size=(48, 48), f=(40, 40)), look_at(3.4, 0.6, 2.0, size=(48, 48), f=(40, 40))
     surface = Surface("colour", ((0.8, 0.8, 0.8),), roughness=0.9)
-    try:
-        for number in (0, 3, 6):
-            scene = small_scene(*cameras, part=sphere(rings=24), on=ground(-0.5), surface=surface)
-            scene = replace(scene, light=Light(skies.sky(number), 0.65, 1.0))
-            bright = []
-            for renderer in (fast, blender):
-                pictures = list(renderer.render(scene))
-                light = [to_linear(picture.image[picture.mask] / 255.0).mean() for picture in pictures]
-                around = [to_linear(picture.image[~picture.mask] / 255.0).mean() for picture in pictures]
-                bright.append((np.mean(light), np.mean(around)))
-            ratio = np.array(bright[0]) / np.array(bright[1])
-            assert (np.abs(np.log(ratio)) < 0.1).all(), f"panorama {number}: {ratio}"
-    finally:
-        blender.close()
+    for number in (0, 3, 6):
+        scene = small_scene(*cameras, part=sphere(rings=24), on=ground(-0.5), surface=surface)
+        scene = replace(scene, light=Light(skies.sky(number), 0.65, 1.0))
+        pictures = [list(renderer.render(scene)) for renderer in renderers]
+        for of_object in (True, False):
+            fast, blender = (mean_light(each, of_object=of_object) for each in pictures)
+            assert abs(np.log(fast / blender)) < 0.1, f"panorama {number}, object {of_object}"
+
+
+def test_colours_between_vertices_are_the_same_by_both_renderers(renderers: tuple[Renderer, Renderer]) -> None:
+    corners = np.array([[0.0, -0.5, -0.5], [0, 0.5, -0.5], [0, 0.5, 0.5], [0, -0.5, 0.5]])
+    colours = np.array([[0.0, 0, 0], [0.1, 0, 0], [1, 1, 1], [0.9, 1, 0.8]])
+    card = Part(corners, np.array([[0, 1, 2], [0, 2, 3]]), colours=colours)
+    scene: Scene = small_scene(look_at(0.0, 1.5, 2.0), part=card)
+    (fast,), (blender,) = (list(renderer.render(scene)) for renderer in renderers)
+    inside = fast.mask & blender.mask
+    assert np.abs(fast.image[inside].astype(int) - blender.image[inside]).mean() < 6

@@ -25,7 +25,7 @@ class Geometry:
 
     Attributes:
         vertices: (V, 8) float32: x y z u, normal v. A normal of length 0: flat shading.
-        colours: (V, 4) uint8 sRGB of vertices.
+        colours: (V, 4) float16 linear colours of vertices: between them light is mixed, as in Blender and glTF.
         faces: (F, 4) uint32: three vertices and the part.
         materials: (P, 4) float32: linear colour, and the texture's number (-1: none).
         textures: (T, S, S', 4) uint8 sRGB, first row at the top.
@@ -33,7 +33,7 @@ class Geometry:
     """
 
     vertices: NDArray[np.float32]
-    colours: NDArray[np.uint8]
+    colours: NDArray[np.float16]
     faces: NDArray[np.uint32]
     materials: NDArray[np.float32]
     textures: NDArray[np.uint8]
@@ -119,11 +119,11 @@ def _vertices(part: Part) -> NDArray[np.float32]:
     return out
 
 
-def _colours(part: Part) -> NDArray[np.uint8]:
-    if part.colours is None:
-        return np.full((len(part.vertices), 4), 255, np.uint8)
-    rgb = np.clip(np.rint(255 * np.nan_to_num(part.colours)), 0, 255).astype(np.uint8)
-    return np.column_stack([rgb, np.full(len(rgb), 255, np.uint8)])
+def _colours(part: Part) -> NDArray[np.float16]:
+    out = np.ones((len(part.vertices), 4), np.float16)
+    if part.colours is not None:
+        out[:, :3] = to_linear(np.clip(np.nan_to_num(part.colours), 0, 1))
+    return out
 
 
 def _base_colour(part: Part) -> NDArray[np.floating]:
