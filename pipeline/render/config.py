@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 from dope.common import settings
+from dope.common.errors import UsageError
 
 Recipe = Literal["modelnet", "shapenet", "abc", "plain", "procedural"]
 
@@ -33,6 +34,9 @@ class ViewpointsConfig:
 
     def __post_init__(self) -> None:
         settings.require_at_least(self, pairs=1, size=16, second_azimuth_deg=0, jitter=0)
+        settings.require_at_least(self, lens_mm=1, sensor_mm=1)
+        _require_range(self, "zenith_deg", 0.1, 179.9)  # straight above nothing says which way is up
+        _require_range(self, "distance", 0.01, 1000)
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,10 @@ class LookConfig:
     materials: str | None = None
     """Folder of materials for the plane (a picture each, or a folder each with albedo, height and roughness); None:
     procedural ones."""
+
+    def __post_init__(self) -> None:
+        settings.require_at_least(self, places=0)
+        _require_range(self, "strength", 0.01, 100)
 
 
 @dataclass(frozen=True)
@@ -97,7 +105,8 @@ class MeshConfig:
     """Pairs of which a view shows less of the object are dropped."""
 
     def __post_init__(self) -> None:
-        settings.require_at_least(self, max_faces=1)
+        settings.require_at_least(self, max_faces=1, min_mask_share=0)
+        _require_at_most(self, min_mask_share=1)
 
 
 @dataclass(frozen=True)
@@ -122,3 +131,20 @@ class RenderConfig:
     """Of the images; views are encoded once more."""
     seed: int = 0
     """Of everything that is drawn, together with the object's id."""
+
+    def __post_init__(self) -> None:
+        settings.require_at_least(self, jpeg_quality=1)
+        _require_at_most(self, jpeg_quality=100)
+
+
+def _require_at_most(config: Any, **most: float) -> None:
+    for name, value in most.items():
+        if getattr(config, name) > value:
+            raise UsageError(f"{name} must be at most {value:g}, not {getattr(config, name)}", where="settings")
+
+
+def _require_range(config: Any, name: str, least: float, most: float) -> None:
+    low, high = getattr(config, name)
+    if not least <= low <= high <= most:  # nor are numbers that are none
+        what = f"{name} must be two rising numbers between {least:g} and {most:g}, not {low:g} and {high:g}"
+        raise UsageError(what, where="settings")

@@ -16,6 +16,7 @@ import pytest
 from dope.common import settings
 from dope.common.errors import BadInput, DopeError, UsageError
 from pipeline.cameras.colmap import read_points
+from pipeline.children import Limits
 from pipeline.commands.render import _limited
 from pipeline.correspond.match import CorrespondConfig
 from pipeline.correspond.pairs import PairsConfig
@@ -26,7 +27,7 @@ from pipeline.render.cameras import paired_cameras
 from pipeline.render.config import CyclesConfig, FastConfig, RenderConfig, ViewpointsConfig
 from pipeline.render.find import find_meshes
 from pipeline.render.prepare import ProceduralSource, prepare_renders
-from pipeline.render.scene import Picture, Scene
+from pipeline.render.scene import RENDERER_VERSIONS, Picture, Scene
 from pipeline.sequence import Sequence
 from pipeline.tasks import RunOptions
 from tests.pipeline.analytic import SphereRenderer
@@ -42,7 +43,7 @@ def spheres_in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pipeline.tasks.run_in_child", lambda run, *args, limits, notify: run(*args, notify))
     monkeypatch.setattr("pipeline.children.Children.call", lambda self, run, *args, notify: run(*args, notify))
     monkeypatch.setattr(prepare, "run_in_child", lambda run, *args, limits: run(*args, None))
-    monkeypatch.setattr(prepare, "_renderer", lambda config: SphereRenderer())
+    monkeypatch.setattr(prepare, "_renderer", lambda config, limits: SphereRenderer())
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +52,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sequence]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pipeline.children.Children.call", lambda self, run, *args, notify: run(*args, notify))
         patch.setattr(prepare, "run_in_child", lambda run, *args, limits: run(*args, None))
-        patch.setattr(prepare, "_renderer", lambda config: SphereRenderer())
+        patch.setattr(prepare, "_renderer", lambda config, limits: SphereRenderer())
         rows = prepare_renders([SOURCE], work, CONFIG, RunOptions())
     assert [(row.stage, row.status) for row in rows] == [("frames", "ok"), ("sfm", "ok"), ("depth", "ok")], rows
     yield Sequence(work / SOURCE.id)
@@ -121,12 +122,12 @@ def test_pairs_that_hardly_show_the_object_are_dropped_with_their_reason(
                 hidden = number in (1, 4)
                 yield replace(picture, mask=picture.mask & np.False_) if hidden else picture
 
-    monkeypatch.setattr(prepare, "_renderer", lambda config: Vanishing())
+    monkeypatch.setattr(prepare, "_renderer", lambda config, limits: Vanishing())
     assert all(row.ok for row in prepare_renders([SOURCE], tmp_path, CONFIG, RunOptions()))
     frames = Sequence(tmp_path / SOURCE.id).read_frames()
     assert [frame.dropped is not None for frame in frames] == [True, True, False, False, True, True, False, False]
     assert frames[0].dropped == "the object fills 0.00% of a view of this pair" and frames[0].image is None
-    monkeypatch.setattr(prepare, "_renderer", lambda config: SphereRenderer(radius=0.004))
+    monkeypatch.setattr(prepare, "_renderer", lambda config, limits: SphereRenderer(radius=0.004))
     failed, *_ = prepare_renders([SOURCE], tmp_path / "none", CONFIG, RunOptions())
     assert failed.status == "failed" and "no pair of views shows it: it fills 0.0" in str(failed.reason)
 
@@ -141,6 +142,16 @@ def test_only_settings_that_matter_make_it_anew(tmp_path: Path) -> None:
     assert not skipped(replace(CONFIG, seed=1))
     assert not skipped(replace(CONFIG, viewpoints=ViewpointsConfig(pairs=2)))
     assert len(Sequence(tmp_path / SOURCE.id).read_frames()) == 4
+
+
+def test_pictures_of_an_older_version_of_the_renderer_are_made_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert all(row.ok and not row.skipped for row in prepare_renders([SOURCE], tmp_path, CONFIG, RunOptions()))
+    monkeypatch.setitem(RENDERER_VERSIONS, "cycles", 99)
+    assert all(row.skipped for row in prepare_renders([SOURCE], tmp_path, CONFIG, RunOptions()))
+    monkeypatch.setitem(RENDERER_VERSIONS, "fast", 99)
+    assert all(row.ok and not row.skipped for row in prepare_renders([SOURCE], tmp_path, CONFIG, RunOptions()))
 
 
 def test_a_run_that_is_killed_between_stages_ends_with_the_same_bytes(tmp_path: Path) -> None:
@@ -187,10 +198,26 @@ def test_another_mesh_of_the_same_name_does_not_take_its_place(tmp_path: Path) -
     assert "holds the sequence of" in str(row.reason)
 
 
+def test_blender_has_the_limits_of_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    monkeypatch.setattr(prepare, "run_in_child", lambda run, *args, limits: run(*args, None))
+    given: list[Limits] = []
+
+    def begin(config: CyclesConfig, limits: Limits) -> None:
+        given.append(limits)
+        raise DopeError("that is enough")
+
+    monkeypatch.setattr("pipeline.render.cycles.renderer.CyclesRenderer", begin)
+    asked = Limits(minutes=90, memory_gib=3)
+    with pytest.raises(DopeError, match="enough"):
+        prepare_renders([SOURCE], tmp_path, replace(CONFIG, renderer="cycles"), RunOptions(limits=asked))
+    assert given == [asked]
+
+
 def test_a_renderer_that_is_not_there_is_one_error_before_anything_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def missing(config: RenderConfig) -> None:
+    def missing(config: RenderConfig, limits: Limits) -> None:
         raise DopeError("there is no OpenGL", remedy="Install it")
 
     prepare_renders([SOURCE], tmp_path / "done", CONFIG, RunOptions())
