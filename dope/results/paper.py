@@ -14,7 +14,7 @@ SPLITS = 5
 
 @dataclass(frozen=True)
 class PaperRow:
-    """A row of one of the paper's tables: `accuracy` in % by column, e.g. {"5w1s": 57.51}; the paper's runs are not ours."""
+    """A row of one of the paper's tables: `accuracy` in % by column, e.g. {"5w1s": 57.51}."""
 
     label: str
     method: str
