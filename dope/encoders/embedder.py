@@ -1,0 +1,159 @@
+"""Any encoder as an `Embedder`: dense features are matched cell by cell, pooled ones by a standard classifier."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor
+
+from dope.common.errors import BadInput, DopeError, UsageError
+from dope.encoders.features import Features, raised, read_features
+from dope.encoders.load import LoadedEncoder
+from dope.lowshot.embedding import Embedder
+from dope.lowshot.encoding import ViewCells
+
+MaskChoice = Literal["none", "given"]
+
+_BATCH_TOLERANCE = 1e-2
+"""Share of the features' scale by which they may differ between batch sizes: half precision does, statistics of the
+batch do far more."""
+
+
+class EncoderEmbedder(Embedder):
+    """An encoder's features for low-shot recognition.
+
+    Dense features (B, D, h, w): a cell's descriptor is the unit vector of its features times its foreground
+    probability, as DOPE's are (paper, section 4), for local matching. Pooled features: the encoder's own where it has
+    some, else the mean over cells, weighted by the mask where there is one; raw, not normalised.
+
+    The mask is the encoder's own where it returns one. With `mask="given"` it is the one that the views come with,
+    shrunk to the grid by area: an oracle, since it was made by the dataset and not predicted by the encoder. With
+    neither, every cell is foreground.
+
+    Args:
+        encoder: what `load_encoder` found.
+        sample: images (B, 3, H, W) in [0, 1], at least one, of the size of the views. They are encoded at once and the
+            first one alone, which tells what kind of features there are, and whether they depend on the batch.
+        mask: "none" or "given".
+
+    Raises:
+        UsageError: `mask="given"` and features without a grid.
+        BadInput: the encoder fails, or returns something else than features, or features that depend on the batch.
+    """
+
+    own_classifier: str
+    has_dense: bool
+
+    def __init__(self, encoder: LoadedEncoder, sample: Tensor, *, mask: MaskChoice = "none") -> None:
+        self.encoder = encoder
+        self.image_size: int | None = None  # an encoder resizes by itself where it has to
+        self._sizes: tuple[tuple[int, ...], ...] | None = None
+        together, alone = self._features(sample), self._features(sample[:1])
+        _check_independence(together, alone, encoder.name)
+        self.has_dense = together.dense is not None
+        self.has_own_mask = together.mask is not None
+        if mask == "given" and not self.has_dense:
+            what = f"{encoder.name} has pooled features only, which no mask can be applied to"
+            raise UsageError(what, where="--encoder-mask given", remedy="Leave it out")
+        self.wants_masks = mask == "given"
+        self.name = encoder.name + (" + given masks" if self.wants_masks else "")
+        self.own_classifier = "local" if self.has_dense else "nearest"
+
+    @torch.inference_mode()
+    def pooled(self, images: Tensor, masks: Tensor | None = None) -> Tensor:
+        """Images (B, 3, H, W) to raw vectors (B, D) float32; `masks` (B, H, W) as `cells` takes them."""
+        features = self._features(images)
+        if features.pooled is not None:
+            return features.pooled
+        assert features.dense is not None
+        weights = self._mask_of(features, masks)
+        if weights is None:
+            return features.dense.mean((2, 3))
+        # a view without foreground is the mean of all of its cells
+        weights = torch.where(weights.sum((1, 2), keepdim=True) > 0, weights, torch.ones_like(weights))
+        return (features.dense * weights[:, None]).sum((2, 3)) / weights.sum((1, 2))[:, None]
+
+    @torch.inference_mode()
+    def cells(self, images: Tensor, masks: Tensor | None = None) -> list[ViewCells]:
+        """Images (B, 3, H, W) to descriptors on the grid.
+
+        Args:
+            images: float in [0, 1].
+            masks: (B, H, W), 1 = object; needed where `wants_masks`.
+
+        Raises:
+            UsageError: the features are pooled.
+        """
+        features = self._features(images)
+        if features.dense is None:
+            what = f"{self.encoder.name} has pooled features only, local matching needs dense ones"
+            raise UsageError(what, where="--classifier local", remedy="Use --classifier nearest, centroid or logistic")
+        norms = self._mask_of(features, masks)
+        if norms is None:
+            norms = torch.ones_like(features.dense[:, 0])
+        return [_view_cells(dense, norm) for dense, norm in zip(F.normalize(features.dense, dim=1), norms, strict=True)]
+
+    def classify(self, vectors: NDArray[np.float32], episodes: object) -> NDArray[np.int64]:
+        raise NotImplementedError("an encoder has none but the standard classifiers")
+
+    def _features(self, images: Tensor) -> Features:
+        try:
+            with torch.inference_mode():
+                output = self.encoder.encode(images)
+        except DopeError:
+            raise
+        except Exception as error:  # whatever somebody else's code raises
+            raise raised(error, images, self.encoder.name) from error
+        features = read_features(output, len(images), self.encoder.name)
+        parts = (features.dense, features.pooled, features.mask)
+        sizes = tuple(() if part is None else tuple(part.shape[1:]) for part in parts)
+        if self._sizes is None:
+            self._sizes = sizes
+        if sizes != self._sizes:
+            what = f"returned features of sizes {_said(self._sizes)}, then of {_said(sizes)} for {len(images)} images"
+            remedy = "The size of an image's features must not depend on the others of its batch"
+            raise BadInput(what, where=f"--encoder {self.encoder.name}", remedy=remedy)
+        return features
+
+    def _mask_of(self, features: Features, masks: Tensor | None) -> Tensor | None:
+        """Foreground probabilities (B, h, w) of the cells, or None."""
+        if not self.wants_masks:
+            return features.mask
+        assert masks is not None and features.dense is not None, "an embedder that wants masks is given some"
+        return F.interpolate(masks.float()[:, None], features.dense.shape[-2:], mode="area")[:, 0]
+
+
+def _view_cells(unit: Tensor, norms: Tensor) -> ViewCells:
+    """Unit vectors (D, h, w) and norms (h, w) of one view as cells sorted by falling norm."""
+    sorted_norms, order = norms.flatten().sort(descending=True, stable=True)
+    descriptors = (unit.flatten(1).T[order] * sorted_norms[:, None]).contiguous()
+    grid = (unit.shape[1], unit.shape[2])
+    nothing_left = descriptors[:0]
+    return ViewCells(grid, order.cpu().numpy(), sorted_norms.cpu().numpy(), descriptors, nothing_left, _all_described)
+
+
+def _all_described(features: Tensor, norms: NDArray[np.float32]) -> Tensor:
+    return features
+
+
+def _check_independence(together: Features, alone: Features, name: str) -> None:
+    """The first image's features must be the same alone and among others."""
+    for kind in ("dense", "pooled", "mask"):
+        one, other = getattr(alone, kind), getattr(together, kind)
+        if one is None:
+            continue
+        scale = float(torch.maximum(one.abs().max(), other.abs().max()))
+        error = float((other[0] - one[0]).abs().max())
+        if error > _BATCH_TOLERANCE * scale:
+            what = f"{kind} features of an image differ with the others of its batch (by {error / scale:.0%})"
+            remedy = "Set BatchNorm and dropout to eval mode, and take no statistics over the batch"
+            raise BadInput(what, where=f"--encoder {name}", remedy=remedy)
+
+
+def _said(sizes: tuple[tuple[int, ...], ...]) -> str:
+    names = zip(("dense", "pooled", "mask"), sizes, strict=True)
+    return ", ".join(f"{name} {'x'.join(map(str, size))}" for name, size in names if size)
