@@ -229,13 +229,15 @@ def our_step(images: list[Any], masks: Any, xy: Any) -> Callable[[], None]:
     from dope.config import load_config
     from dope.distributed import Ranks
     from dope.heap import keep_heap
+    from dope.methods import method_of
     from dope.state import new_state, wrap
     from dope.step import SampledBatch, compute_losses
 
     keep_heap()
     ranks, config = Ranks(0, 1, torch.device("cpu")), load_config("paper")
-    state = new_state(config, ranks)
-    online = wrap(state.network, ranks, compiled=False)
+    method = method_of(config)
+    state = new_state(method, ranks)
+    online = wrap(method.online(state.network), ranks)
     cells, valid = (xy / 4).long(), torch.ones(PAIRS, POINTS, dtype=torch.bool)
     batch = PairBatch(images[0], images[1], masks, masks, xy, valid, torch.arange(PAIRS), ("",) * PAIRS)
     sampled = SampledBatch(batch, cells[..., [1, 0]], cells[..., [3, 2]], valid)

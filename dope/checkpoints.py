@@ -16,22 +16,22 @@ from __future__ import annotations
 
 import pickle
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
+from torch import nn
 
 import dope
 from dope.common import files, settings
 from dope.common.errors import BadInput, UsageError
 from dope.config import CheckpointConfig, TrainConfig, differing_keys
 from dope.distributed import restarts, started_by
-from dope.networks import DopeNetwork, NetworkConfig
+from dope.methods import method_class
+from dope.methods.base import Method
+from dope.networks import DopeNetwork
 from dope.order import Place
 from dope.preset_files import merged
 from dope.state import TrainState
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 FORMAT = 1
 LATEST, BEST, ORIGIN = "latest", "best", "origin"
@@ -39,29 +39,27 @@ PARTS = (
     "step", "epoch", "samples_consumed", "network", "momentum", "optimiser", "config", "config_hash", "dataset",
     "validation", "untrained", "versions",
 )  # fmt: skip
-"""What a checkpoint of this format has; `damaged` came later."""
+"""What a checkpoint of this format has; `damaged` and `facts` came later."""
 
 
-def save_checkpoint(
-    run: Path, state: TrainState, config: TrainConfig, dataset: str, *, best_pck: float | None = None
-) -> Path:
+def save_checkpoint(run: Path, state: TrainState, method: Method, dataset: str, *, best: float | None = None) -> Path:
     """Write RUN/checkpoints/step-XXXXXXXX.pt, its hash and the pointers; delete what `config.checkpoint` lets go.
 
     Args:
         dataset: fingerprint of the training shards.
-        best_pck: the PCK of this very step, where it is the best so far; `best` then points here.
+        best: the score of this very step, where it is the best so far; the pointer `best` then points here.
 
     Raises:
         DiskFull: the checkpoints that were there before are untouched.
     """
-    path = run / "checkpoints" / f"step-{state.step:08d}.pt"
+    config, path = method.config, run / "checkpoints" / f"step-{state.step:08d}.pt"
     values = {
         "format": FORMAT,
         "step": state.step,
         "epoch": state.place.epoch,
         "samples_consumed": state.place.consumed,
         "network": state.network.state_dict(),
-        "momentum": state.momentum.network.state_dict(),
+        "momentum": method.companion_state(state.momentum),
         "optimiser": state.optimiser.state_dict(),
         "config": settings.to_dict(config),
         "config_hash": settings.config_hash(config),
@@ -69,6 +67,7 @@ def save_checkpoint(
         "validation": state.validation,
         "untrained": state.untrained,
         "damaged": sorted(state.damaged),
+        "facts": state.facts,
         "versions": {"dope": dope.__version__, "torch": str(torch.__version__)},
     }
     with files.atomic_path(path) as partial:
@@ -82,8 +81,8 @@ def save_checkpoint(
         _hash_path(path).unlink(missing_ok=True)
     files.write_bytes(_hash_path(path), f"{digest}  {path.name}\n".encode())
     files.write_bytes(path.parent / LATEST, f"{path.name}\n".encode())
-    if best_pck is not None:
-        files.write_bytes(path.parent / BEST, f"{path.name} {best_pck}\n".encode())
+    if best is not None:
+        files.write_bytes(path.parent / BEST, f"{path.name} {best}\n".encode())
     for old in _superfluous(run, state.step, config.checkpoint):
         _hash_path(old).unlink(missing_ok=True)
         old.unlink(missing_ok=True)
@@ -119,8 +118,8 @@ def pointed_to(run: Path, pointer: str) -> Path | None:
     return path if path and path.is_file() else None
 
 
-def best_pck(run: Path, *, before: int) -> float:
-    """The PCK of the best checkpoint; minus infinity where there is none from before step `before`.
+def best_score(run: Path, *, before: int) -> float:
+    """The score of the best checkpoint; minus infinity where there is none from before step `before`.
 
     A run that goes on from an earlier checkpoint comes by its later ones again.
     """
@@ -198,7 +197,7 @@ def read_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str,
     return values
 
 
-def resume(path: Path, state: TrainState, config: TrainConfig, dataset: str) -> None:
+def resume(path: Path, state: TrainState, method: Method, dataset: str) -> None:
     """Put `state` where the checkpoint was.
 
     Raises:
@@ -208,7 +207,8 @@ def resume(path: Path, state: TrainState, config: TrainConfig, dataset: str) -> 
     path = find_checkpoint(path)
     values = read_checkpoint(path, next(state.network.parameters()).device)
     # a setting younger than the checkpoint had its default's effect then
-    differing = differing_keys(settings.to_dict(config), merged(settings.to_dict(TrainConfig()), values["config"]))
+    then = merged(settings.to_dict(TrainConfig()), values["config"])
+    differing = differing_keys(settings.to_dict(method.config), then)
     if differing:
         keys = "; ".join(f"{key} is {ours}, was {theirs}" for key, (ours, theirs) in differing.items())
         raise UsageError(
@@ -224,7 +224,7 @@ def resume(path: Path, state: TrainState, config: TrainConfig, dataset: str) -> 
         )
     try:
         state.network.load_state_dict(values["network"])
-        state.momentum.network.load_state_dict(values["momentum"])
+        method.load_companion(state.momentum, values["momentum"])
         state.optimiser.load_state_dict(values["optimiser"])
     except (RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:
         reason = str(error).split("\n", 1)[0]
@@ -235,9 +235,7 @@ def resume(path: Path, state: TrainState, config: TrainConfig, dataset: str) -> 
     state.damaged = set(values.get("damaged", ()))
 
 
-def resume_newest(
-    run: Path, state: TrainState, config: TrainConfig, dataset: str
-) -> tuple[Path | None, list[BadInput]]:
+def resume_newest(run: Path, state: TrainState, method: Method, dataset: str) -> tuple[Path | None, list[BadInput]]:
     """Put `state` where the newest checkpoint of a run that can be read was; damaged ones are passed over.
 
     Returns:
@@ -253,7 +251,7 @@ def resume_newest(
     damaged: list[BadInput] = []
     for path in reversed([path for path in list_checkpoints(run) if path.name <= newest.name]):
         try:
-            resume(path, state, config, dataset)
+            resume(path, state, method, dataset)
         except BadInput as error:
             damaged.append(error)
         else:
@@ -263,7 +261,7 @@ def resume_newest(
 
 
 def go_on_from(
-    how: str | Path, out: Path, state: TrainState, config: TrainConfig, dataset: str
+    how: str | Path, out: Path, state: TrainState, method: Method, dataset: str
 ) -> tuple[Path | None, list[BadInput]]:
     """Put `state` where the `how` of `dope train --resume` says: auto, never, or a checkpoint or run.
 
@@ -279,7 +277,7 @@ def go_on_from(
     """
     newest = latest_checkpoint(out)
     if how == "auto" or (newest is not None and _began_like_this(how, out)):
-        return resume_newest(out, state, config, dataset)
+        return resume_newest(out, state, method, dataset)
     found = None if how == "never" else find_checkpoint(Path(how))
     if newest is not None and (found is None or not _is_of(found, out)):
         raise UsageError(
@@ -288,7 +286,7 @@ def go_on_from(
             remedy="Give another --out, delete this folder, or go on with --resume auto",
         )
     if found is not None:
-        resume(found, state, config, dataset)
+        resume(found, state, method, dataset)
     return found, []
 
 
@@ -320,21 +318,43 @@ def _is_of(checkpoint: Path, run: Path) -> bool:
 
 
 def load_network(path: Path, device: torch.device | str = "cpu") -> tuple[DopeNetwork, dict[str, Any]]:
-    """The trained network of a checkpoint (or of a run's newest one), in eval mode, and what is known of it.
+    """The trained DOPE network of a checkpoint (or of a run's newest one), in eval mode, and what is known of it.
 
-    The second value has `path`, `sha256`, `step`, `epoch`, `config` (plain nested dict), `config_hash`, `dataset`,
-    `validation` and `versions`.
+    The second value is that of `load_method`.
+
+    Raises:
+        BadInput: no checkpoint there, or it cannot be read.
+        UsageError: of another method, whose network describes whole images only.
+    """
+    method, network, meta = load_method(path, device)
+    if not isinstance(network, DopeNetwork):
+        what = f"is of method {method.name}, which has no dense descriptors"
+        raise UsageError(what, where=meta["path"], remedy="Give a checkpoint of `dope train --method dope`")
+    return network, meta
+
+
+def load_method(path: Path, device: torch.device | str = "cpu") -> tuple[Method, nn.Module, dict[str, Any]]:
+    """The method of a checkpoint (or of a run's newest one), its trained network in eval mode, and what is known of it.
+
+    The last value has `path`, `sha256`, `step`, `epoch`, `config` (plain nested dict), `config_hash`, `dataset`,
+    `validation`, `versions` and `facts`.
 
     Raises:
         BadInput: no checkpoint there, or it cannot be read.
     """
     path = find_checkpoint(path)
     values = read_checkpoint(path, device)
-    network = DopeNetwork(settings.from_mapping(NetworkConfig, values["config"]["network"], where=str(path)))
-    weights: dict[str, Tensor] = values["network"]
-    network.load_state_dict(weights)
+    config = settings.from_mapping(TrainConfig, values["config"], where=str(path))
+    method, facts = method_class(config.method)(config), values.get("facts", {})
+    network = method.new_network(facts)
+    try:
+        network.load_state_dict(values["network"])
+    except (RuntimeError, TypeError, AttributeError) as error:
+        reason = str(error).split("\n", 1)[0]
+        raise BadInput(f"does not fit the network of its settings ({reason})", where=path) from error
     meta = {k: values[k] for k in ("step", "epoch", "config", "config_hash", "dataset", "validation", "versions")}
-    return network.to(device).eval(), {"path": str(path), "sha256": files.sha256_of(path), **meta}
+    known = {"path": str(path), "sha256": files.sha256_of(path), **meta, "facts": facts}
+    return method, network.to(device).eval(), known
 
 
 def _hash_path(path: Path) -> Path:

@@ -16,9 +16,18 @@ from dope.augmentation import AugmentationConfig
 from dope.common import files, settings
 from dope.config_rules import check as check  # its callers need not know where the rules lie
 from dope.config_rules import flat
+from dope.methods.configs import (
+    FeatConfig,
+    MethodName,
+    MoCoConfig,
+    SimpleShotConfig,
+    SimSiamConfig,
+    SupMoCoConfig,
+    VispeConfig,
+)
 from dope.networks import NetworkConfig
 from dope.order import Order
-from dope.preset_files import merged, preset_values
+from dope.preset_files import merged, method_values, preset_values
 
 RESULT_NEUTRAL = (
     "data.workers", "data.max_bad_samples", "device", "channels_last", "compile", "validation", "checkpoint", "log",
@@ -53,6 +62,8 @@ class DataConfig:
     """Neighbouring samples that stay together in sequential order: less is more random, more reads longer."""
     min_correspondences: int = 1
     """Training pairs with fewer correspondences are left out."""
+    categories: tuple[str, ...] = ()
+    """Only objects of these categories; none given: all (and those without a category, where no labels are used)."""
     max_bad_samples: int = 0
     """Damaged samples (by their keys, over all ranks and resumes) that are put up with; one more stops the run."""
 
@@ -73,14 +84,21 @@ class LossConfig:
 
 @dataclass(frozen=True)
 class OptimiserConfig:
-    """AdamW."""
+    """What moves the weights."""
+
+    name: Literal["adamw", "sgd"] = "adamw"
+    """AdamW, or stochastic gradient descent with momentum (weight decay then is part of the gradient)."""
 
     lr: float = 1e-4
     """Highest learning rate."""
     weight_decay: float = 1e-2
     """Decoupled weight decay."""
     betas: tuple[float, float] = (0.9, 0.999)
-    """Decay rates of the two moments."""
+    """AdamW: decay rates of the two moments."""
+    momentum: float = 0.9
+    """SGD: share of the last step that is kept."""
+    nesterov: bool = False
+    """SGD: Nesterov's form of it."""
 
 
 @dataclass(frozen=True)
@@ -91,8 +109,12 @@ class ScheduleConfig:
     """Passes in which each object is seen `data.pairs_per_object` times."""
     max_steps: int = 0
     """Ends the run, and the fall of the learning rate, after so many steps though epochs are left; 0 = no limit."""
-    shape: Literal["cosine", "constant"] = "cosine"
-    """Cosine to 0 at the end, or constant."""
+    shape: Literal["cosine", "constant", "steps"] = "cosine"
+    """Cosine to 0 at the end, constant, or falling in steps."""
+    milestones: tuple[float, ...] = (0.7, 0.9)
+    """steps: shares of the run, in (0, 1), at which the rate falls."""
+    factor: float = 0.1
+    """steps: what it is multiplied by there."""
     per: Literal["epoch", "step"] = "epoch"
     """Whether the rate changes once an epoch (the paper) or every step."""
     warmup_steps: int = 0
@@ -156,6 +178,8 @@ class DistributedConfig:
 class TrainConfig:
     """Everything that decides what a training run does."""
 
+    method: MethodName = "dope"
+    """What is trained: DOPE, or one of the baselines (`dope train --method`)."""
     data: DataConfig = field(default_factory=DataConfig)
     """Images, batches and points."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
@@ -188,17 +212,39 @@ class TrainConfig:
     """auto (CUDA where there is one), cpu, cuda or cuda:N."""
     log: LogConfig = field(default_factory=LogConfig)
     """Curves and pictures."""
+    simpleshot: SimpleShotConfig = field(default_factory=SimpleShotConfig)
+    """Of `method` simpleshot."""
+    feat: FeatConfig = field(default_factory=FeatConfig)
+    """Of `method` feat."""
+    supmoco: SupMoCoConfig = field(default_factory=SupMoCoConfig)
+    """Of `method` supmoco."""
+    vispe: VispeConfig = field(default_factory=VispeConfig)
+    """Of `method` vispe."""
+    moco: MoCoConfig = field(default_factory=MoCoConfig)
+    """Of `method` vispe_moco."""
+    simsiam: SimSiamConfig = field(default_factory=SimSiamConfig)
+    """Of `method` vispe_simsiam."""
     seed: int = 12345
     """Everything random derives from it."""
 
 
-def load_config(preset: str | None = None, yaml: Path | None = None, overrides: Iterable[str] = ()) -> TrainConfig:
+def load_config(
+    preset: str | None = None,
+    yaml: Path | None = None,
+    overrides: Iterable[str] = (),
+    *,
+    method: str | None = None,
+) -> TrainConfig:
     """Resolve a run's settings: the preset, on top of it a YAML file, on top of it `key=value` overrides.
+
+    With a `method`, what its own file (presets/methods/) gives for the preset comes between preset and YAML file.
 
     Raises:
         UsageError: an unknown preset or key (the closest known one is named), a value of the wrong type or range.
     """
     values = {} if preset is None else preset_values(preset)
+    if method is not None:
+        values = merged(values, method_values(method, preset))
     if yaml is not None:
         values = merged(values, settings.load_yaml(yaml))
     where = str(yaml) if yaml is not None else f"preset {preset}"

@@ -67,6 +67,16 @@ def decode_pair(
     return DecodedPair((images[0], images[1]), (masks[0], masks[1]), points, number, key)
 
 
+def decode_view(members: Mapping[str, bytes], *, image: NDArray[np.uint8], mask: NDArray[np.bool_], where: str) -> None:
+    """Decode the members `jpg` and `png` of a view sample into an image (3, S, S) uint8 RGB and a mask (S, S) bool.
+
+    Raises:
+        BadInput: a member is missing or cannot be decoded; `where` names the shard.
+    """
+    _image(members, "jpg", image, where)
+    _mask(members, "png", mask, where)
+
+
 def decode_jpeg(data: bytes, smallest: int) -> tuple[NDArray[np.uint8] | None, int]:
     """A JPEG no larger than needed, and by what it was reduced (1, 2, 4 or 8).
 

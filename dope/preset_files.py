@@ -52,6 +52,30 @@ def preset_values(name: str, *, where: str = "--preset", extended_by: tuple[str,
     return merged(preset_values(str(base), where=f"{path}: {EXTENDS}", extended_by=(*extended_by, name)), values)
 
 
+def method_values(method: str, preset: str | None) -> dict[str, Any]:
+    """What a method's file (presets/methods/METHOD.yaml) says for a preset: `all`, then the presets that this one
+    extends from the base on, each over the one before.
+
+    Raises:
+        UsageError: no such method.
+    """
+    from dope.methods import method_class
+
+    method_class(method)  # says which ones there are
+    path = PRESETS / "methods" / f"{method}.yaml"
+    values: dict[str, Any] = {"method": method}
+    sections = settings.load_yaml(path) if path.is_file() else {}
+    for name in ("all", *(extended(preset) if preset is not None else ())):
+        values = merged(values, sections.get(name) or {})
+    return values
+
+
+def extended(name: str) -> tuple[str, ...]:
+    """A preset and those that it extends, the base first."""
+    base = settings.load_yaml(PRESETS / f"{name}.yaml").get(EXTENDS)
+    return (*(extended(str(base)) if base is not None else ()), name)
+
+
 def merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
     """Nested settings, those of `above` over those of `below`; neither is changed."""
     result = dict(below)

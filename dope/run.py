@@ -10,24 +10,24 @@ from pathlib import Path
 from typing import Any
 
 from dope import checkpoints, damage
-from dope.augmentation import no_augmentation
-from dope.batch import DamagedSample, PairBatch
+from dope.batch import DamagedSample
 from dope.common import files, settings
 from dope.common.errors import BadInput, DopeError
 from dope.config import TrainConfig, write_config
 from dope.distributed import Ranks
 from dope.figures.held_out import held_out_sheet
 from dope.meter import Meter
+from dope.methods import method_of
+from dope.methods.base import Method, Order
 from dope.networks import DopeNetwork
 from dope.networks.untrained import settle_batchnorm
-from dope.order import SampleOrder
 from dope.queries import micro_batches, resolved_precision
 from dope.run_lock import only_one
 from dope.run_logging import RunLog, SilentLog, describe_start
 from dope.state import TrainState, new_state, total_steps
 from dope.storage import Shards
-from dope.streaming import PairDataset, PairLoader
-from dope.validation import evaluating, pck
+from dope.streaming import PairLoader
+from dope.validation import evaluating
 from dope.wandb_run import require_wandb
 
 
@@ -44,9 +44,10 @@ class Run:
     out: Path
     config: TrainConfig
     ranks: Ranks
-    dataset: PairDataset
-    order: SampleOrder
-    held_out: list[PairBatch]
+    method: Method
+    dataset: Any
+    order: Order
+    held_out: list[Any]
     held_out_damaged: list[DamagedSample]
     state: TrainState
     resumed_from: Path | None
@@ -89,6 +90,9 @@ class Run:
     def facts(self) -> dict[str, Any]:
         """What is trained on what, from where to where."""
         return {
+            "method": self.method.name,
+            "samples": "pairs" if self.method.pairs else "views",
+            "batch_of": self.method.batch_of,
             "pairs": len(self.dataset),
             "left_out": self.dataset.index.left_out,
             "objects": self.order.n_objects,
@@ -120,54 +124,58 @@ class Run:
             self.save(log, is_best=is_best)
 
     def validate(self, log: RunLog | SilentLog) -> bool:
-        """PCK and mask IoU on all ranks' held-out pairs, logged, drawn and kept for the checkpoint.
+        """The method's score on all ranks' held-out samples, logged, drawn and kept for the checkpoint.
 
         Returns:
-            Whether the PCK is higher than that of the run's best checkpoint.
+            Whether it is higher than that of the run's best checkpoint.
         """
         if self.config.validation.every == 0:
             return False
         network, step = self.state.network, self.state.step
         if step == 0:  # random weights without the statistics of real images would be no baseline at all
-            network = DopeNetwork(network.config)  # a plain copy: the ranks' numbers of batches may differ
+            network = self.method.new_network(self.state.facts)  # plain: the ranks' numbers of batches may differ
             network.load_state_dict(self.state.network.state_dict())
             network.to(self.ranks.device)
-            images = (no_augmentation(batch.to(self.ranks.device)).images1 for batch in self.held_out)
-            settle_batchnorm(network, images)
+            held_out = (batch.to(self.ranks.device) for batch in self.held_out)
+            settle_batchnorm(network, self.method.plain_images(held_out))
         self.ranks.copy_from_first(network)  # the ranks' BatchNorm statistics differ by their last batch
-        result = pck(network, self.held_out, points=self.config.data.points, ranks=self.ranks)
+        result = self.method.validate(network, self.held_out, self.ranks)
         if result["pairs"] == 0:
             if step == 0:
-                log.say("no held-out pairs (split val): nothing is validated")
+                log.say("nothing is held out (split val): nothing is validated")
             return False
         self.state.validation = result
         log.event("validation", step, self.state.place.epoch, result)
-        if self.ranks.is_first and self.config.log.pictures:
+        if self.ranks.is_first and self.config.log.pictures and isinstance(network, DopeNetwork):
             title, device = f"held-out pairs at step {step}", self.ranks.device
             with evaluating(network):
                 sheet = held_out_sheet(network, self.held_out, self.config.log.pictures, title=title, device=device)
             if sheet is not None:
                 log.picture("validation/pairs", step, sheet)
-        return result["pck"] > checkpoints.best_pck(self.out, before=step)
+        return result[self.method.score] > checkpoints.best_score(self.out, before=step)
 
     def save(self, log: RunLog | SilentLog, *, is_best: bool = False) -> None:
         """Write a checkpoint on the first rank."""
         if self.ranks.is_first:
-            best_pck = self.state.validation["pck"] if is_best and self.state.validation else None
+            best = self.state.validation[self.method.score] if is_best and self.state.validation else None
             fingerprint = self.dataset.index.fingerprint
-            path = checkpoints.save_checkpoint(self.out, self.state, self.config, fingerprint, best_pck=best_pck)
+            self.method.before_save(self.state.network, self.dataset)
+            path = checkpoints.save_checkpoint(self.out, self.state, self.method, fingerprint, best=best)
             log.event("checkpoint", self.state.step, self.state.place.epoch, {"file": path.name, "best": is_best})
 
     def end(self, meter: Meter, log: RunLog | SilentLog) -> dict[str, Any]:
         """The result of `train`, once all ranks are done."""
         self.ranks.wait()
-        newest = checkpoints.latest_checkpoint(self.out)
+        newest, score = checkpoints.latest_checkpoint(self.out), self.method.score
         result = {
             "status": "finished" if self.state.step >= self.total_steps else "stopped",
             "step": self.state.step,
             "steps_of_this_call": self.state.step - meter.first_step,
             "epoch": self.state.place.epoch,
             "loss": None if math.isnan(meter.loss) else meter.loss,  # a finished run has nothing left to measure
+            "score_name": score,
+            "score": (self.state.validation or {}).get(score),
+            "score_untrained": (self.state.untrained or {}).get(score),
             "pck": (self.state.validation or {}).get("pck"),
             "pck_untrained": (self.state.untrained or {}).get("pck"),
             "mask_iou": (self.state.validation or {}).get("mask_iou"),
@@ -188,38 +196,26 @@ def open_run(shards: Shards, out: Path, config: TrainConfig, ranks: Ranks, resum
     """
     if config.log.wandb:
         require_wandb()
-    data = config.data
-    dataset = PairDataset(
-        shards,
-        "train",
-        image_size=data.image_size,
-        max_points=data.max_points,
-        min_correspondences=data.min_correspondences,
-    )
+    data, method = config.data, method_of(config)
+    dataset = method.dataset(shards, "train")
     if not len(dataset):
-        where = dataset.index.storage.where("index.parquet")
-        raise BadInput("has no pairs for training", where=where, remedy="Hold out less: `dope prep shards --set`")
-    order = SampleOrder(
-        dataset.index.objects,
-        data.batch_size,
-        pairs_per_object=data.pairs_per_object,
-        seed=config.seed,
-        order=data.order,
-        block=data.block,
-    )
+        where = dataset.index.storage.where("index.parquet" if method.pairs else "views.parquet")
+        what = f"has no {'pairs' if method.pairs else 'views'} for training"
+        raise BadInput(what, where=where, remedy="Hold out less: `dope prep shards --set`")
+    order = method.order(dataset)
     if data.batch_size % ranks.world == 0:  # else `SampleOrder.batches` says so
         micro_batches(data.batch_size // ranks.world, data.micro_batch)
-    held_out, held_out_damaged = read_held_out(shards, config, ranks)
-    state = new_state(config, ranks)
+    held_out, held_out_damaged = read_held_out(shards, method, ranks)
+    state = new_state(method, ranks, method.facts(dataset))
     with _on_first(ranks, lambda: only_one(out)):
         fingerprint = dataset.index.fingerprint
-        found, damaged = checkpoints.go_on_from(resume, out, state, config, fingerprint)
+        found, damaged = checkpoints.go_on_from(resume, out, state, method, fingerprint)
         if len(set(ranks.collect(state.step))) > 1:
             what = "the ranks do not see the same checkpoints"
             raise DopeError(what, where=out / "checkpoints", remedy="All machines must share this folder")
         if ranks.is_first:
             checkpoints.note_origin(resume, out, found)
-        yield Run(out, config, ranks, dataset, order, held_out, held_out_damaged, state, found, damaged)
+        yield Run(out, config, ranks, method, dataset, order, held_out, held_out_damaged, state, found, damaged)
 
 
 @contextmanager
@@ -238,17 +234,17 @@ def _on_first(ranks: Ranks, entered: Callable[[], AbstractContextManager[None]])
         yield
 
 
-def read_held_out(shards: Shards, config: TrainConfig, ranks: Ranks) -> tuple[list[PairBatch], list[DamagedSample]]:
-    """This rank's share of the validation pairs, decoded once and kept, without the damaged ones, and these.
+def read_held_out(shards: Shards, method: Method, ranks: Ranks) -> tuple[list[Any], list[DamagedSample]]:
+    """This rank's share of the validation samples, decoded once and kept, without the damaged ones, and these.
 
     Empty without validation or split `val`.
     """
-    if config.validation.every == 0:
+    settings = method.config.validation
+    if settings.every == 0:
         return [], []
-    dataset = PairDataset(shards, "val", image_size=config.data.image_size, max_points=config.data.points)
-    mine = list(range(min(config.validation.pairs, len(dataset))))[ranks.rank :: ranks.world]
-    size = config.validation.batch_size
-    rows = [mine[i : i + size] for i in range(0, len(mine), size)]
+    dataset = method.dataset(shards, "val")
+    mine = method.held_out_rows(dataset, settings.pairs)[ranks.rank :: ranks.world]
+    rows = [mine[i : i + settings.batch_size] for i in range(0, len(mine), settings.batch_size)]
     batches = list(PairLoader(dataset, rows, fill_damaged=True))
     whole = [batch.without_damaged() for batch in batches]
     return [batch for batch in whole if len(batch)], [one for batch in batches for one in batch.damaged.values()]

@@ -61,7 +61,7 @@ class RunLog:
                 console=self._console,
             )
             self._task = self._progress.add_task("", total=total, completed=start, left="")
-        self._total, self._pck, self._line_due = total, "", 0.0
+        self._total, self._score, self._line_due = total, "", 0.0
         self._began, self._began_at = time.perf_counter(), start
         self._wandb = WandbRun(wandb, run, config or {}, self.say) if wandb else None
 
@@ -94,8 +94,9 @@ class RunLog:
             if self._wandb:
                 self._wandb.numbers(event, step, values)
         if event == "validation":
-            self._pck = f"  PCK {values['pck']:.3f}  mask IoU {values['mask_iou']:.2f}"
-            self.say(f"step {step:6d}{self._pck} on {values['points']} points of {values['pairs']} held-out pairs")
+            self._score = describe_validation(values)
+            points = f" on {values['points']} points" if "points" in values else ""
+            self.say(f"step {step:6d}{self._score}{points} of {values['pairs']} held-out samples")
 
     def picture(self, name: str, step: int, image: Image) -> None:
         """Show an image (H, W, 3) uint8 RGB in TensorBoard and W&B."""
@@ -113,7 +114,7 @@ class RunLog:
         speed = f"{meter.pairs_per_second:.1f} pairs/s  data wait {meter.data_wait:.0%}"
         # not Rich's own estimate, which knows nothing where a step takes more than half a minute
         seconds = (time.perf_counter() - self._began) / max(1, step - self._began_at) * (self._total - step)
-        text, left = f"{speed}  loss {meter.loss:.4f}{self._pck}", f"{timedelta(seconds=round(seconds))} left"
+        text, left = f"{speed}  loss {meter.loss:.4f}{self._score}", f"{timedelta(seconds=round(seconds))} left"
         if self._progress:
             self._progress.update(self._task, completed=step, description=text, left=left)
         elif time.perf_counter() >= self._line_due or step == self._total:
@@ -150,11 +151,20 @@ class SilentLog:
         """Nothing."""
 
 
+def describe_validation(values: Mapping[str, Any]) -> str:
+    """The held-out scores of a method, in a few words."""
+    names = {"pck": "PCK {:.3f}", "mask_iou": "mask IoU {:.2f}", "retrieval": "retrieval {:.3f}"}
+    names["accuracy"] = "accuracy {:.3f}"
+    return "".join(f"  {text.format(values[name])}" for name, text in names.items() if name in values)
+
+
 def describe_start(facts: dict[str, Any]) -> str:
     """The first lines that a run says."""
+    kind, unit = facts["samples"], facts["batch_of"]
     ranks = "" if facts["world"] == 1 else f" on {facts['world']} ranks"
     lines = [
-        f"training on {facts['pairs']:,} pairs of {facts['objects']:,} objects: {facts['batch_size']} pairs a step, "
+        f"training {facts['method']} on {facts['pairs']:,} {kind} of {facts['objects']:,} objects: "
+        f"{facts['batch_size']} {unit} a step, "
         f"{facts['steps_per_epoch']:,} steps an epoch, {facts['total_steps']:,} in all",
         f"{facts['parameters'] / 1e6:.1f} M parameters, {facts['precision']}, {facts['device']}{ranks}",
     ]
@@ -164,7 +174,8 @@ def describe_start(facts: dict[str, Any]) -> str:
             "reaches optimiser.lr. Lower schedule.warmup_steps, or raise schedule.epochs or data.pairs_per_object"
         )
     if facts["left_out"]:
-        lines.append(f"{facts['left_out']:,} pairs have too few correspondences (data.min_correspondences): left out")
+        why = "have too few correspondences (data.min_correspondences)" if kind == "pairs" else "have no category"
+        lines.append(f"{facts['left_out']:,} {kind} {why}: left out")
     if facts["resumed_from"]:
         lines.append(f"going on at step {facts['resumed_at']:,} from {facts['resumed_from']}")
     return "\n".join(lines)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,11 +15,11 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from dope.common.errors import BadInput
+from dope.common.errors import BadInput, UsageError
 from dope.storage import REMEDY, Shards, Storage, open_storage, reason_of
 from dope.tar_samples import REMAKE, Location, OtherSample, ShardReader
 
-COLUMNS = ("key", "shard", "offset", "size", "sequence", "split", "n_correspondences")
+COLUMNS = ("key", "shard", "offset", "size", "sequence", "split", "n_correspondences", "category")
 CHECKED_TOGETHER = 64
 """Shards whose first samples are read at a time."""
 
@@ -32,6 +33,7 @@ class SampleIndex:
         keys, shards, sequences: (N,) str.
         offsets, sizes: (N,) int64, the bytes of each sample in its shard.
         correspondences: (N,) int64, how many each sample has.
+        categories: (N,) str, empty where the object has none.
         objects: (N,) int64, the place of the sample's sequence in the sorted list of all sequences of the dataset.
         fingerprint: of the contents of this split's shards, the same for every copy.
         left_out: samples that the split has besides these.
@@ -44,6 +46,7 @@ class SampleIndex:
     offsets: NDArray[np.int64]
     sizes: NDArray[np.int64]
     correspondences: NDArray[np.int64]
+    categories: NDArray[np.str_]
     objects: NDArray[np.int64]
     fingerprint: str
     left_out: int = 0
@@ -70,9 +73,33 @@ class SampleIndex:
                 if most
                 else "Prepare other views: `dope prep status` says why pairs have no correspondences",
             )
-        columns = ("keys", "shards", "sequences", "offsets", "sizes", "correspondences", "objects")
-        kept = {name: getattr(self, name)[enough] for name in columns}
-        return replace(self, left_out=self.left_out + int((~enough).sum()), **kept)
+        return replace(self._where(enough), left_out=self.left_out + int((~enough).sum()))
+
+    def of_categories(self, names: Sequence[str]) -> SampleIndex:
+        """Only the samples of objects of these categories; of all where none is given.
+
+        Raises:
+            UsageError: a category of which there is no sample.
+        """
+        if not names or not len(self):
+            return self
+        check_categories(names, self.categories.tolist(), self.storage.address)
+        return self._where(np.isin(self.categories, list(names)))
+
+    def _where(self, chosen: NDArray[np.bool_]) -> SampleIndex:
+        columns = ("keys", "shards", "sequences", "offsets", "sizes", "correspondences", "categories", "objects")
+        return replace(self, **{name: getattr(self, name)[chosen] for name in columns})
+
+
+def check_categories(names: Sequence[str], known: Iterable[str], where: str) -> None:
+    """Raise `UsageError` naming the first category that is not among the known ones, with the closest of them."""
+    there = sorted({name for name in known if name})
+    for name in names:
+        if name not in there:
+            close = difflib.get_close_matches(name, there, n=3, cutoff=0.5)
+            shown = ", ".join(there[:8]) + (" ..." if len(there) > 8 else "")
+            hint = f"did you mean {' or '.join(map(repr, close))}?" if close else f"there are: {shown or 'none'}"
+            raise UsageError(f"no samples of category '{name}' ({hint})", where=where, remedy="See data.categories")
 
 
 def read_index(shards: Shards, split: str) -> SampleIndex:
@@ -86,7 +113,7 @@ def read_index(shards: Shards, split: str) -> SampleIndex:
     storage = open_storage(shards)
     sizes = storage.sizes()
     manifest = read_manifest(storage, sizes)
-    table, digest = read_table(storage, "index.parquet", COLUMNS)
+    table, digest = read_table(storage, "index.parquet", COLUMNS, may_be_null=("category",))
     tables = storage.read_json("dataset.json").get("tables")
     if isinstance(tables, dict) and tables.get("index.parquet", digest) != digest:
         raise BadInput("is not the one of dataset.json", where=storage.where("index.parquet"), remedy=REMAKE)
@@ -103,6 +130,7 @@ def read_index(shards: Shards, split: str) -> SampleIndex:
             offsets=columns["offset"].astype(np.int64),
             sizes=columns["size"].astype(np.int64),
             correspondences=columns["n_correspondences"].astype(np.int64),
+            categories=np.array([name or "" for name in table["category"].to_pylist()], str),
             objects=np.searchsorted(sequences, names),
             fingerprint=_fingerprint(
                 {name: manifest[name]["sha256"] for name in sorted(manifest) if _is_of(name, split)}

@@ -14,9 +14,9 @@ from torch.nn.parallel import DistributedDataParallel
 from dope.common.seeds import derive_seed
 from dope.config import TrainConfig
 from dope.distributed import Ranks
-from dope.networks import DopeNetwork, MomentumEncoder, synchronise_batchnorm
+from dope.methods.base import Facts, Method
+from dope.networks import synchronise_batchnorm
 from dope.order import Place
-from dope.queries import OnlineEncoder
 
 
 @dataclass
@@ -24,51 +24,69 @@ class TrainState:
     """What a checkpoint holds.
 
     Attributes:
+        momentum: what goes with the network without gradient (`Method.new_companion`).
         step: optimiser steps done.
         place: place in the order of samples.
-        validation: newest result of `dope.validation.pck`, and that of the untrained network.
+        validation: newest result of `Method.validate`, and that of the untrained network.
         damaged: keys of the damaged samples that were met.
+        facts: what the network's shape takes from its data.
     """
 
-    network: DopeNetwork
-    momentum: MomentumEncoder
+    network: nn.Module
+    momentum: Any
     optimiser: torch.optim.Optimizer
     step: int = 0
     place: Place = field(default_factory=Place)
-    validation: dict[str, float] | None = None
-    untrained: dict[str, float] | None = None
+    validation: dict[str, Any] | None = None
+    untrained: dict[str, Any] | None = None
     damaged: set[str] = field(default_factory=set)
+    facts: Facts = field(default_factory=dict)
 
 
-def new_state(config: TrainConfig, ranks: Ranks) -> TrainState:
-    """An untrained network with its momentum copy and optimiser, the same on every rank."""
+def new_state(method: Method, ranks: Ranks, facts: Facts | None = None) -> TrainState:
+    """An untrained network with its companion and optimiser, the same on every rank."""
+    config = method.config
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derive_seed(config.seed, "weights"))
-        network = DopeNetwork(config.network)
+        network = method.new_network(facts or {})
+    method.start(network)
     if config.distributed.sync_batchnorm and ranks.world > 1:
         network = synchronise_batchnorm(network, ranks.device)
     layout = torch.channels_last if config.channels_last else torch.contiguous_format
     network = network.to(device=ranks.device, memory_format=layout).train()  # type: ignore[call-overload]
-    momentum = MomentumEncoder(network, config.momentum, compiled=config.compile)
+    companion = method.new_companion(network).to(ranks.device)
     options = config.optimiser
-    optimiser = torch.optim.AdamW(
-        network.parameters(), options.lr, betas=options.betas, weight_decay=options.weight_decay, fused=True
-    )
+    groups = method.parameter_groups(network)
+    optimiser: torch.optim.Optimizer
+    if options.name == "adamw":
+        optimiser = torch.optim.AdamW(
+            groups, options.lr, betas=options.betas, weight_decay=options.weight_decay, fused=True
+        )
+    else:
+        optimiser = torch.optim.SGD(
+            groups,
+            options.lr,
+            momentum=options.momentum,
+            weight_decay=options.weight_decay,
+            nesterov=options.nesterov,
+            fused=True,
+        )
     optimiser.register_load_state_dict_post_hook(_match_layout)
-    return TrainState(network, momentum, optimiser)
+    return TrainState(network, companion, optimiser, facts=facts or {})
 
 
 def _match_layout(optimiser: torch.optim.Optimizer) -> None:
     """Lay out loaded moments as their parameters are: the fused step walks over the memory of both at once."""
     for parameter, values in optimiser.state.items():
         for name, value in values.items():
+            if value is None:  # of SGD without momentum
+                continue
             if value.shape == parameter.shape and value.stride() != parameter.stride():
                 values[name] = torch.empty_like(parameter).copy_(value)
 
 
-def wrap(network: DopeNetwork, ranks: Ranks, *, compiled: bool = False) -> nn.Module:
-    """The online encoder, its gradients averaged over ranks where there are several."""
-    online = OnlineEncoder(network, compiled=compiled)
+def wrap(online: nn.Module, ranks: Ranks) -> nn.Module:
+    """What is called in a step, its gradients averaged over ranks where there are several."""
     if ranks.world == 1:
         return online
     known = inspect.signature(DistributedDataParallel).parameters
@@ -89,7 +107,7 @@ def total_steps(config: TrainConfig, steps_per_epoch: int) -> int:
 
 
 def learning_rate(config: TrainConfig, step: int, steps_per_epoch: int) -> float:
-    """The learning rate of step `step` (from 0): linear warm-up, then cosine to 0 or constant."""
+    """The learning rate of step `step` (from 0): linear warm-up, then cosine to 0, constant, or falling in steps."""
     schedule, peak = config.schedule, config.optimiser.lr
     if step < schedule.warmup_steps:
         return peak * (step + 1) / (schedule.warmup_steps + 1)
@@ -100,4 +118,12 @@ def learning_rate(config: TrainConfig, step: int, steps_per_epoch: int) -> float
         share = step // steps_per_epoch * steps_per_epoch / total
     else:
         share = (step - schedule.warmup_steps) / max(1, total - schedule.warmup_steps)
+    if schedule.shape == "steps":
+        return peak * schedule.factor ** sum(share >= milestone for milestone in schedule.milestones)
     return peak * 0.5 * (1 + math.cos(math.pi * share))
+
+
+def set_learning_rate(optimiser: torch.optim.Optimizer, lr: float, peak: float) -> None:
+    """Give each group of parameters the step's learning rate, as `Method.parameter_groups` wants it."""
+    for group in optimiser.param_groups:
+        group["lr"] = (peak if group.get("lr_constant") else lr) * group.get("lr_scale", 1.0)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import cycle
-from typing import Any
+from typing import Any, Generic, Protocol, TypeVar
 
 import cv2
 import numpy as np
@@ -26,6 +26,29 @@ ALL_FOUR = 0x01010101
 """Four bools that are True, as one number: NumPy's `all` over so short an axis takes twenty times as long."""
 
 
+class LoadedBatch(Protocol):
+    """What a loader needs of a batch."""
+
+    @property
+    def damaged(self) -> Mapping[int, DamagedSample]: ...
+
+
+BatchOf = TypeVar("BatchOf", bound=LoadedBatch, covariant=True)
+
+
+class BatchSource(Protocol[BatchOf]):
+    """Samples that come in batches (`PairDataset`, `dope.single_views.ViewDataset`)."""
+
+    @property
+    def index(self) -> Any: ...
+
+    def batch(self, rows: Sequence[int]) -> BatchOf:
+        """The samples of `rows`, damaged ones filled in for."""
+
+    def error(self, sample: DamagedSample) -> BadInput:
+        """A damaged sample as an error."""
+
+
 class PairDataset(Dataset):
     """The view pairs of one split of a folder of shards, decoded by row.
 
@@ -35,6 +58,7 @@ class PairDataset(Dataset):
         image_size: side of the decoded images; views of another size are resized and their points scaled.
         max_points: correspondences read of a pair.
         min_correspondences: pairs with fewer are left out.
+        categories: only pairs of objects of these; none given: all.
 
     Raises:
         BadInput: the shards are not those that the index describes (see `read_index`), or no pair has enough
@@ -49,8 +73,10 @@ class PairDataset(Dataset):
         image_size: int = 224,
         max_points: int = 4096,
         min_correspondences: int = 0,
+        categories: Sequence[str] = (),
     ) -> None:
-        self.index: SampleIndex = read_index(shards, split).with_correspondences(min_correspondences)
+        index: SampleIndex = read_index(shards, split).of_categories(categories)
+        self.index = index.with_correspondences(min_correspondences)
         self.image_size, self.max_points = image_size, max_points
         self._reader = ShardReader(self.index.storage)
 
@@ -148,7 +174,7 @@ def _batch_of(pairs: Sequence[DecodedPair], images: NDArray[np.uint8], masks: ND
     )
 
 
-class PairLoader:
+class PairLoader(Generic[BatchOf]):
     """Iterates over the batches of `rows`, in that order, whatever the number of workers.
 
     Args:
@@ -162,7 +188,7 @@ class PairLoader:
 
     def __init__(
         self,
-        dataset: PairDataset,
+        dataset: BatchSource[BatchOf],
         rows: Iterable[list[int]],
         *,
         workers: int = 0,
@@ -181,7 +207,7 @@ class PairLoader:
             generator=torch.Generator(),  # leaves the global random state alone
         )
 
-    def __iter__(self) -> Iterator[PairBatch]:
+    def __iter__(self) -> Iterator[BatchOf]:
         try:
             for batch in self._loader:
                 if isinstance(batch, DopeError):
@@ -203,13 +229,13 @@ class PairLoader:
 class _Batches(Dataset):
     """A batch for a list of rows. Errors are handed over as values: DataLoader would turn them into a traceback."""
 
-    def __init__(self, dataset: PairDataset) -> None:
+    def __init__(self, dataset: BatchSource[Any]) -> None:
         self.dataset = dataset
 
-    def __getitem__(self, row: int) -> PairBatch | DopeError:
+    def __getitem__(self, row: int) -> Any:
         return self.__getitems__([row])
 
-    def __getitems__(self, rows: list[int]) -> PairBatch | DopeError:
+    def __getitems__(self, rows: list[int]) -> Any:
         try:
             return self.dataset.batch(rows)
         except DopeError as error:

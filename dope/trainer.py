@@ -1,4 +1,4 @@
-"""Training: `train` streams shards into a DOPE network, on one process or on each of those that torchrun started."""
+"""Training: `train` streams shards into a network, by whatever method, on one process or each that torchrun started."""
 
 from __future__ import annotations
 
@@ -16,8 +16,7 @@ from dope.memory import MemoryWatch
 from dope.meter import Meter
 from dope.profiling import StepProfiler
 from dope.run import open_run
-from dope.state import learning_rate, wrap
-from dope.step import compute_losses, sample_batch
+from dope.state import learning_rate, set_learning_rate, wrap
 from dope.stop_signals import StopRequest
 from dope.storage import Shards
 from dope.streaming import PairLoader
@@ -46,8 +45,8 @@ def train(
 
     Returns:
         `status` (finished, or stopped by a signal or `stop_after`), `step`, `steps_of_this_call`, `epoch`, `loss`,
-        `pck`, `pck_untrained`, `mask_iou`, `damaged` (samples), `checkpoint`, `seconds`, `pairs_per_second`; None
-        where there is none.
+        `score_name`, `score`, `score_untrained` (for DOPE also `pck`, `pck_untrained`, `mask_iou`), `damaged`
+        (samples), `checkpoint`, `seconds`, `pairs_per_second`; None where there is none.
 
     Raises:
         BadInput: shards or checkpoint missing or damaged, or more samples than `data.max_bad_samples` are.
@@ -63,30 +62,29 @@ def train(
         StopRequest() as stop,
         open_run(shards, out, config, ranks, resume) as run,
     ):
-        state, last_step = run.state, run.total_steps
+        state, method, last_step = run.state, run.method, run.total_steps
         if stop_after is not None:
             last_step = min(last_step, state.step + stop_after)
         rows = run.order.batches(state.place, config.schedule.epochs, rank=ranks.rank, world=ranks.world)
         pin, share = ranks.device.type == "cuda", Share(ranks.rank, ranks.world)
         loader = PairLoader(run.dataset, rows, workers=config.data.workers, pin_memory=pin, fill_damaged=True)
-        online, meter = wrap(state.network, ranks, compiled=config.compile), Meter(state.step)
+        online, meter = wrap(method.online(state.network), ranks), Meter(state.step)
         with run.begin() as log, StepProfiler(out, profile, ranks, log.say) as profiler:
             stopping = state.step >= last_step
             for batch in meter.waiting_for(loader) if not stopping else ():
                 lr = learning_rate(config, state.step, run.order.steps_per_epoch)
-                for group in state.optimiser.param_groups:
-                    group["lr"] = lr
-                sampled = sample_batch(batch.to(ranks.device), config, state.step, share)
+                set_learning_rate(state.optimiser, lr, config.optimiser.lr)
+                prepared = method.prepare(batch.to(ranks.device), state.step, share)
                 news = stop.requested or bool(batch.damaged)
                 with MemoryWatch(online, ranks.device) if state.step == meter.first_step else nullcontext() as memory:
-                    losses = compute_losses(online, state.momentum, sampled, config, ranks, step=state.step, stop=news)
+                    losses = method.losses(online, state.momentum, prepared, ranks, step=state.step, stop=news)
                     asked_to_stop = losses.stop and damage.heed(run, stop.requested, batch, log)
                     state.optimiser.zero_grad(set_to_none=True)
                     losses.backward()
                 report = {**losses.report, "grad_norm": guard.gradient_norm(state.network.parameters()), "lr": lr}
                 guard.require_finite(run, report, batch, log)
                 state.optimiser.step()
-                state.momentum.update(state.network)
+                method.after_step(state.network, state.momentum)
 
                 state.step, state.place = state.step + 1, run.order.after(state.place)
                 # other ranks would have to be asked first, which the next step does

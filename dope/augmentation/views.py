@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dope.augmentation import background, colour, geometry, on_cpu
 from dope.augmentation.config import AugmentationConfig
-from dope.augmentation.draws import WHOLE, Draws, rows_where, uniform_rows
+from dope.augmentation.draws import WHOLE, Draws, Share, rows_where, uniform_rows
 
 COLUMNS = 1 + colour.COLUMNS + geometry.COLUMNS + background.COLUMNS
 
@@ -40,7 +40,7 @@ class ViewPlan:
 
 @torch.no_grad()
 def augment_images(
-    images: Tensor, masks: Tensor, config: AugmentationConfig, generator: torch.Generator
+    images: Tensor, masks: Tensor, config: AugmentationConfig, generator: torch.Generator, share: Share = WHOLE
 ) -> tuple[Tensor, Tensor]:
     """Augment views that come alone: each loses its background with `config.single_background_p`.
 
@@ -49,11 +49,12 @@ def augment_images(
         masks: (B, 1, H, W) bool. A view with an empty mask keeps its background.
         config: probabilities and ranges; `background_removal` "off" keeps every background.
         generator: the result is a function of it and of the inputs.
+        share: which part of the global batch this is, where other ranks hold the others.
 
     Returns:
         images (B, 3, H, W) float32 in [0, 1] and masks (B, 1, H, W) bool.
     """
-    draws = Draws(uniform_rows(len(images), 1 + COLUMNS, generator, images.device, WHOLE))
+    draws = Draws(uniform_rows(len(images), 1 + COLUMNS, generator, images.device, share))
     remove = draws.chance(config.single_background_p) & (config.background_removal != "off")
     new_images, new_masks, _ = augment_views([images], masks, remove, config, draws, generator)
     return new_images, new_masks

@@ -9,14 +9,17 @@ from typing import Annotated, Any
 import typer
 
 from dope.commands.options import Shards
+from dope.methods import KNOWN
 from dope.preset_files import preset_names, preset_summary
 
+METHODS_HELP = "What to train: " + ", ".join(KNOWN) + "; all but the first are the paper's baselines."
 PRESETS_HELP = "\n\n".join(f"{name}: {preset_summary(name)}" for name in preset_names())
 
 
 def train(
     shards: Shards,
     out: Annotated[Path, typer.Option("--out", help="RUN: the folder of this run.", show_default=False)],
+    method: Annotated[str, typer.Option(help=METHODS_HELP)] = "dope",
     preset: Annotated[str, typer.Option(help=PRESETS_HELP)] = "paper",
     config: Annotated[
         Path | None, typer.Option("--config", help="YAML file of settings, on top of the preset.", show_default=False)
@@ -56,7 +59,7 @@ def train(
         ),
     ] = False,
 ) -> None:
-    """Train DOPE: corresponding pixels of two views get the same descriptor, all others different ones.
+    """Train DOPE: corresponding pixels of two views get the same descriptor, all others different ones; or a baseline.
 
     RUN receives config.yaml (all settings, to look up and to change by --set), checkpoints/, metrics.jsonl and
     tensorboard/. Run it again to go on; SIGTERM, SIGUSR1 and Ctrl-C write a checkpoint and exit with 75, on which a
@@ -82,7 +85,7 @@ def train(
     from dope.config import load_config
 
     overrides = [*(set_ or ()), *([] if max_bad_samples is None else [f"data.max_bad_samples={max_bad_samples}"])]
-    resolved = load_config(preset, config, overrides)
+    resolved = load_config(preset, config, overrides, method=method)
     from dope.launch import as_rank, is_rank, launch
 
     if verify_shards and not is_rank() and os.environ.get("RANK", "0") == "0":
@@ -107,12 +110,13 @@ def _print_training(result: dict[str, Any], out: Path) -> None:
     from rich.console import Console
     from rich.markup import escape
 
-    pck = "" if result["pck"] is None else f", held-out PCK {result['pck']:.1%}"
-    if result["pck"] is not None and result["pck_untrained"] is not None:
-        pck += f" (untrained {result['pck_untrained']:.1%})"
+    name = {"pck": "PCK"}.get(result["score_name"], result["score_name"])
+    score = "" if result["score"] is None else f", held-out {name} {result['score']:.1%}"
+    if result["score"] is not None and result["score_untrained"] is not None:
+        score += f" (untrained {result['score_untrained']:.1%})"
     folder = escape(str(out))
     loss = "" if result["loss"] is None else f": loss {result['loss']:.3f}"
     Console(highlight=False).print(
-        f"{result['status']} at step {result['step']}{loss}{pck}; {result['seconds']:.0f} s; see [bold]{folder}[/]",
+        f"{result['status']} at step {result['step']}{loss}{score}; {result['seconds']:.0f} s; see [bold]{folder}[/]",
         soft_wrap=True,
     )

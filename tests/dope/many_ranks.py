@@ -13,6 +13,7 @@ from dope.augmentation import no_augmentation
 from dope.batch import TENSORS, PairBatch
 from dope.config import TrainConfig, load_config
 from dope.distributed import Ranks, ranks_of
+from dope.methods import method_of
 from dope.networks.batchnorm import batchnorms
 from dope.state import new_state, wrap
 from dope.step import SampledBatch, choose_cells, compute_losses, momentum_keys
@@ -68,12 +69,12 @@ def outcome(batch: SampledBatch, config: TrainConfig, ranks: Ranks, *, training:
         training: whether BatchNorm takes the batch's statistics in the step; it is frozen otherwise. The encoders
             then compute in float64: in float32, merely another order of the images changes gradients by over 1e-5.
     """
-    state = new_state(config, ranks)
+    state = new_state(method_of(config), ranks)
     if training:
         state.network.double(), state.momentum.double()
         views = replace(batch.views, images1=batch.views.images1.double(), images2=batch.views.images2.double())
         batch = replace(batch, views=views)
-    online = wrap(state.network, ranks).train(training)
+    online = wrap(method_of(config).online(state.network), ranks).train(training)
     state.momentum.train(training)
     losses = compute_losses(online, state.momentum, batch, config, ranks, step=5, stop=ranks.rank == 1)
     losses.backward()

@@ -13,13 +13,14 @@ from dope import trainer
 from dope.augmentation import Share
 from dope.common.errors import DopeError
 from dope.distributed import Ranks
+from dope.methods import dope as dope_method
 
 
 def main(what: str, shards: Path, out: Path) -> None:
     """Train, and write OUT/said-<rank>.txt: how it ended, and a number that tells the weights."""
     torch.set_num_threads(1)
     seen: dict[str, Any] = {}
-    real_sample, real_wrap = trainer.sample_batch, trainer.wrap
+    real_sample, real_wrap = dope_method.sample_batch, trainer.wrap
 
     def sample(batch: Any, config: Any, step: int, share: Share) -> Any:
         sampled = real_sample(batch, config, step, share)
@@ -29,13 +30,13 @@ def main(what: str, shards: Path, out: Path) -> None:
         seen["weights"] = sum(float(p.detach().double().sum()) for p in seen["network"].parameters())
         return sampled
 
-    def wrap(network: Any, ranks: Ranks, *, compiled: bool) -> torch.nn.Module:
+    def wrap(network: Any, ranks: Ranks) -> torch.nn.Module:
         seen["network"] = network
         spoil = what == "gradient" and ranks.rank == 1
         next(network.parameters()).register_hook(lambda g: g * float("nan") if spoil and seen["step"] == 2 else g)
-        return real_wrap(network, ranks, compiled=compiled)
+        return real_wrap(network, ranks)
 
-    trainer.sample_batch, trainer.wrap = sample, wrap
+    dope_method.sample_batch, trainer.wrap = sample, wrap
     try:
         trainer.train(shards, out, tiny("validation.every=0"))
         said = "finished"

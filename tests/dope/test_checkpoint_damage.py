@@ -23,13 +23,14 @@ from dope.checkpoints import (
 )
 from dope.common import files
 from dope.common.errors import BadInput, UsageError
+from dope.methods import method_of
 from dope.state import new_state
 from tests.dope.tiny_checkpoints import ALONE, CONFIG, at, keeping, trained
 
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    save_checkpoint(tmp_path, trained(), CONFIG, "shards")
+    save_checkpoint(tmp_path, trained(), method_of(CONFIG), "shards")
     return tmp_path
 
 
@@ -81,7 +82,7 @@ DAMAGES = (truncate, empty, text, code, code_in_a_whole_checkpoint, other_dict)
 def test_damage_is_an_error_that_names_the_file_and_another_checkpoint(
     run: Path, damage: Callable[[Path], None], with_hash: bool
 ) -> None:
-    path = save_checkpoint(run, at(9), CONFIG, "shards")
+    path = save_checkpoint(run, at(9), method_of(CONFIG), "shards")
     damage(path)
     if not with_hash:
         path.with_name(path.name + ".sha256").unlink()
@@ -106,28 +107,28 @@ def test_code_in_a_checkpoint_is_never_run(
 
 
 def test_another_format_is_refused_with_what_to_do(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    save_checkpoint(run, at(9), CONFIG, "shards")
+    save_checkpoint(run, at(9), method_of(CONFIG), "shards")
     monkeypatch.setattr(checkpoints, "FORMAT", checkpoints.FORMAT + 1)
     message = rf"step-00000009\.pt: was written by dope {checkpoints.dope.__version__} in format 1; .*Use that version"
     for read in (read_checkpoint, load_network):
         with pytest.raises(UsageError, match=message):
             read(run)
     with pytest.raises(UsageError, match="in format 1"):  # nor is an older one taken in its place
-        resume_newest(run, new_state(CONFIG, ALONE), CONFIG, "shards")
+        resume_newest(run, new_state(method_of(CONFIG), ALONE), method_of(CONFIG), "shards")
 
 
 @pytest.mark.parametrize("damage", [flip, truncate, empty])
 def test_going_on_passes_over_damaged_checkpoints(tmp_path: Path, damage: Callable[[Path], None]) -> None:
-    paths = [save_checkpoint(tmp_path, at(step), keeping(keep=0), "shards") for step in (3, 6, 9)]
+    paths = [save_checkpoint(tmp_path, at(step), method_of(keeping(keep=0)), "shards") for step in (3, 6, 9)]
     for path in paths[1:]:
         damage(path)
-    state = new_state(CONFIG, ALONE)
-    found, damaged = resume_newest(tmp_path, state, CONFIG, "shards")
+    state = new_state(method_of(CONFIG), ALONE)
+    found, damaged = resume_newest(tmp_path, state, method_of(CONFIG), "shards")
     assert found == paths[0] and state.step == 3
     assert [error.where for error in damaged] == [str(paths[2]), str(paths[1])]
     damage(paths[0])
     with pytest.raises(BadInput, match=r"step-00000009\.pt: .*no older one can be read either"):
-        resume_newest(tmp_path, state, CONFIG, "shards")
+        resume_newest(tmp_path, state, method_of(CONFIG), "shards")
 
 
 def parts(*without: str, **other: Any) -> Callable[[Path], None]:
@@ -160,4 +161,4 @@ def test_what_only_looks_like_a_checkpoint_is_explained(run: Path, damage: Calla
     (path,) = list_checkpoints(run)
     damage(path)
     with pytest.raises((BadInput, UsageError), match=rf"step-00000002\.pt: {what}"):
-        resume(run, new_state(CONFIG, ALONE), CONFIG, "shards")
+        resume(run, new_state(method_of(CONFIG), ALONE), method_of(CONFIG), "shards")

@@ -18,6 +18,7 @@ from dope.checkpoints import list_checkpoints, read_checkpoint
 from dope.common.errors import BadInput
 from dope.config import TrainConfig, load_config
 from dope.distributed import Ranks
+from dope.methods import method_of
 from dope.order import Place, SampleOrder
 from dope.run_logging import read_metrics
 from dope.shard_index import read_index
@@ -82,8 +83,8 @@ def test_a_damaged_sample_is_filled_in_for_by_a_good_one_without_points(copy: Pa
 def test_what_fills_in_has_no_part_in_the_contrastive_loss(copy: Path) -> None:
     def contrastive(batch: PairBatch) -> dict[str, float]:
         config, alone = tiny(), Ranks(0, 1, torch.device("cpu"))
-        state = new_state(config, alone)
-        online = wrap(state.network, alone).eval()
+        state = new_state(method_of(config), alone)
+        online = wrap(method_of(config).online(state.network), alone).eval()
         state.momentum.eval()
         sampled = choose_cells(no_augmentation(batch), 8, torch.full((len(batch),), 0.5))
         return compute_losses(online, state.momentum, sampled, config, alone).report

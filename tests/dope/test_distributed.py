@@ -14,11 +14,12 @@ import pytest
 import torch
 from tiny_shards import write_shards
 
-from dope.commands import options
 from dope.checkpoints import list_checkpoints, load_network, read_checkpoint
+from dope.commands import options
 from dope.common.errors import UsageError
 from dope.config import load_config
 from dope.distributed import Ranks, pick_device, ranks_of
+from dope.methods import method_of
 from dope.run_logging import read_metrics
 from dope.state import new_state
 from dope.step import momentum_keys
@@ -105,7 +106,7 @@ def test_keys_are_made_in_shuffled_batches_and_come_back_in_order(
 ) -> None:
     batch = many_ranks.global_batch(shards, "shuffled")
     order = torch.randperm(8, generator=torch.Generator().manual_seed(3))
-    momentum = new_state(many_ranks.config_of("shuffled"), ALONE).momentum
+    momentum = new_state(method_of(many_ranks.config_of("shuffled")), ALONE).momentum
     expected = torch.empty(8, 8, 8)
     for rows in order.chunk(2):  # BatchNorm in training mode: a key depends on who shares its batch
         expected[rows] = momentum.sample(momentum(batch.views.images2[rows]), batch.cells2[rows])

@@ -17,6 +17,7 @@ from dope.common.errors import BadInput, DopeError, UsageError
 from dope.config import TrainConfig, load_config
 from dope.distributed import Ranks
 from dope.memory import MemoryWatch
+from dope.methods import method_of
 from dope.networks.compiling import compiled
 from dope.queries import autocast, micro_batches
 from dope.run_logging import read_metrics
@@ -40,8 +41,8 @@ def tiny(*overrides: str) -> TrainConfig:
 
 def stepped(shards: Path, config: TrainConfig, *, training: bool) -> tuple[Any, StepLosses]:
     """A state whose weights have their gradients, and the losses."""
-    state = new_state(config, ALONE)
-    online = wrap(state.network, ALONE, compiled=config.compile).train(training)
+    state = new_state(method_of(config), ALONE)
+    online = wrap(method_of(config).online(state.network), ALONE).train(training)
     state.momentum.train(training)
     losses = compute_losses(online, state.momentum, many_ranks.global_batch(shards, "plain"), config, ALONE)
     losses.backward()
@@ -161,7 +162,7 @@ def test_compiling_changes_no_key(shards: Path, tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(torch, "compile", compile_)
     train(shards, tmp_path, tiny(*RUN, "schedule.max_steps=1", "compile=true"))
     assert compiled == [(4, 3, 32, 32)] * 2  # the momentum encoder and the online encoder
-    assert set(load_network(tmp_path)[0].state_dict()) == set(new_state(tiny(), ALONE).network.state_dict())
+    assert set(load_network(tmp_path)[0].state_dict()) == set(new_state(method_of(tiny()), ALONE).network.state_dict())
 
 
 def test_what_cannot_be_compiled_is_explained_and_other_errors_pass(monkeypatch: pytest.MonkeyPatch) -> None:

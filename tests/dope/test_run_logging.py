@@ -181,6 +181,16 @@ def test_progress_in_a_terminal_is_one_live_line(tmp_path: Path, monkeypatch: py
 
 def test_a_run_that_never_leaves_its_warm_up_is_told() -> None:
     facts = dict.fromkeys(("pairs", "objects", "batch_size", "steps_per_epoch", "left_out", "resumed_at"), 1)
-    facts |= {"parameters": 1, "precision": "fp32", "device": "cpu", "world": 1, "resumed_from": None, "left_out": 0}
+    facts |= {
+        "parameters": 1,
+        "method": "dope",
+        "samples": "pairs",
+        "batch_of": "pairs",
+        "precision": "fp32",
+        "device": "cpu",
+        "world": 1,
+        "resumed_from": None,
+        "left_out": 0,
+    }
     assert "warm-up" in describe_start(facts | {"total_steps": 1000, "warmup_steps": 1000})
     assert "warm-up" not in describe_start(facts | {"total_steps": 1001, "warmup_steps": 1000})

@@ -19,6 +19,7 @@ from dope.checkpoints import list_checkpoints, load_network
 from dope.common.errors import BadInput, DopeError, UsageError
 from dope.config import TrainConfig
 from dope.distributed import Ranks
+from dope.methods import dope as dope_method
 from dope.run_logging import SilentLog, read_metrics
 from dope.state import wrap
 from dope.trainer import train
@@ -93,7 +94,7 @@ def test_a_run_says_what_it_trains_on_and_where_it_goes_on(
 ) -> None:
     train(shards, tmp_path, tiny("validation.every=0"), stop_after=3)
     said = capsys.readouterr().err
-    assert "training on 24 pairs of 8 objects: 4 pairs a step, 2 steps an epoch, 6 in all\n" in said
+    assert "training dope on 24 pairs of 8 objects: 4 pairs a step, 2 steps an epoch, 6 in all\n" in said
     assert "M parameters, fp32, cpu\n" in said and "going on" not in said
     train(shards, tmp_path, tiny("validation.every=0"))
     assert f"going on at step 3 from {tmp_path}/checkpoints/step-00000003.pt\n" in capsys.readouterr().err
@@ -162,7 +163,7 @@ def test_a_run_too_short_to_be_profiled_says_so(
 def test_a_loss_that_is_not_finite_stops_with_step_and_samples(
     shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = trainer.sample_batch
+    real = dope_method.sample_batch
 
     def poisoned(batch: Any, config: TrainConfig, step: int, share: Share) -> object:
         sampled = real(batch, config, step, share)
@@ -170,7 +171,7 @@ def test_a_loss_that_is_not_finite_stops_with_step_and_samples(
             sampled.views.images1[0, 0, 0, 0] = float("nan")
         return sampled
 
-    monkeypatch.setattr(trainer, "sample_batch", poisoned)
+    monkeypatch.setattr(dope_method, "sample_batch", poisoned)
     with pytest.raises(DopeError, match=r"the loss is nan at step 2 .*object_00\d-000\d") as caught:
         train(shards, tmp_path, tiny("validation.every=0"))
     assert "into another --out with a lower --set optimiser.lr" in str(caught.value)
@@ -212,10 +213,10 @@ def test_a_gradient_that_is_not_finite_stops_before_it_reaches_the_weights(
         before.update(weights)
         return gradient if len(networks) < 3 else gradient * float("inf")
 
-    def hooked(network: torch.nn.Module, ranks: Ranks, *, compiled: bool) -> torch.nn.Module:
+    def hooked(network: torch.nn.Module, ranks: Ranks) -> torch.nn.Module:
         networks.append(network)
         next(network.parameters()).register_hook(overflowing)
-        return wrap(network, ranks, compiled=compiled)  # type: ignore[arg-type]
+        return wrap(network, ranks)
 
     monkeypatch.setattr(trainer, "wrap", hooked)
     with pytest.raises(DopeError, match=r"the norm of the gradient is (inf|nan) at step 2 \(loss \d.*object_00"):

@@ -18,13 +18,14 @@ from many_ranks import part
 from tiny_runs import TINY, losses_of, tiny
 from tiny_shards import write_shards
 
-from dope import trainer
 from dope.augmentation import Share, no_augmentation
 from dope.batch import PairBatch
 from dope.checkpoints import list_checkpoints, load_network
 from dope.common.errors import BadInput, UsageError
 from dope.config import TrainConfig, load_config
 from dope.distributed import Ranks
+from dope.methods import dope as dope_method
+from dope.methods import method_of
 from dope.run_logging import read_metrics
 from dope.state import TrainState, learning_rate, new_state, wrap
 from dope.step import StepLosses, choose_cells, compute_losses, sample_batch
@@ -79,13 +80,13 @@ def test_stopping_and_going_on_is_bitwise_the_same(shards: Path, tmp_path: Path)
 def test_a_signal_within_a_step_ends_the_run_after_this_very_step(
     shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = trainer.compute_losses
+    real = dope_method.compute_losses
 
     def signalled(*arguments: Any, **options: Any) -> StepLosses:
         os.kill(os.getpid(), signal.SIGUSR1)
         return real(*arguments, **options)
 
-    monkeypatch.setattr(trainer, "compute_losses", signalled)
+    monkeypatch.setattr(dope_method, "compute_losses", signalled)
     assert train(shards, tmp_path, tiny("validation.every=0"))["step"] == 1
 
 
@@ -188,9 +189,11 @@ def test_pairs_without_valid_points_do_no_harm(shards: Path) -> None:
     half, none = batch.valid.clone(), torch.zeros_like(batch.valid)
     half[0] = False
     for valid, points in ((half, 24), (none, 0)):
-        state = new_state(config, ALONE)
+        state = new_state(method_of(config), ALONE)
         sampled = choose_cells(no_augmentation(replace(batch, valid=valid)), config.data.points)
-        losses = compute_losses(wrap(state.network, ALONE), state.momentum, sampled, config, ALONE)
+        losses = compute_losses(
+            wrap(method_of(config).online(state.network), ALONE), state.momentum, sampled, config, ALONE
+        )
         losses.backward()
         assert losses.report["points"] == points and math.isfinite(losses.report["loss"])
         assert all(p.grad is None or bool(torch.isfinite(p.grad).all()) for p in state.network.parameters())
@@ -198,10 +201,12 @@ def test_pairs_without_valid_points_do_no_harm(shards: Path) -> None:
 
 def test_the_loss_is_the_mean_over_points_by_a_naive_loop(shards: Path) -> None:
     config = tiny()
-    state, batch = new_state(config, ALONE), batch_of(shards, config)
+    state, batch = new_state(method_of(config), ALONE), batch_of(shards, config)
     batch.valid[1, 3:] = False  # three points only
     sampled = choose_cells(no_augmentation(batch), config.data.points, STARTS)
-    report = compute_losses(wrap(state.network, ALONE), state.momentum, sampled, config, ALONE).report
+    report = compute_losses(
+        wrap(method_of(config).online(state.network), ALONE), state.momentum, sampled, config, ALONE
+    ).report
     first = state.network(sampled.views.images1)
     queries = state.network.sample(first, sampled.cells1)
     keys = state.momentum.sample(state.momentum(sampled.views.images2), sampled.cells2)
@@ -366,9 +371,11 @@ def batch_of(shards: Path, config: TrainConfig) -> PairBatch:
 
 
 def one_step(shards: Path, config: TrainConfig) -> tuple[TrainState, StepLosses]:
-    state = new_state(config, ALONE)
+    state = new_state(method_of(config), ALONE)
     sampled = sample_batch(batch_of(shards, config), config, step=0)
-    return state, compute_losses(wrap(state.network, ALONE), state.momentum, sampled, config, ALONE)
+    return state, compute_losses(
+        wrap(method_of(config).online(state.network), ALONE), state.momentum, sampled, config, ALONE
+    )
 
 
 def descendants(pid: int) -> list[int]:

@@ -13,6 +13,7 @@ from dope.checkpoints import (
 )
 from dope.config import CheckpointConfig, TrainConfig, load_config
 from dope.distributed import Ranks
+from dope.methods import method_of
 from dope.order import Place
 from dope.state import TrainState, new_state
 
@@ -26,7 +27,7 @@ def keeping(**policy: Any) -> TrainConfig:
 
 
 def at(step: int) -> TrainState:
-    return replace(new_state(CONFIG, ALONE), step=step)
+    return replace(new_state(method_of(CONFIG), ALONE), step=step)
 
 
 def steps_of(run: Path) -> list[int]:
@@ -34,7 +35,7 @@ def steps_of(run: Path) -> list[int]:
 
 
 def trained(config: TrainConfig = CONFIG, steps: int = 2) -> TrainState:
-    state = new_state(config, ALONE)
+    state = new_state(method_of(config), ALONE)
     generator = torch.Generator().manual_seed(0)
     for _ in range(steps):
         images = torch.rand(2, 3, 32, 32, generator=generator)
