@@ -23,9 +23,7 @@ def results(
     ],
     form: Annotated[
         str | None,
-        typer.Option(
-            "--format", help="text, markdown or latex.  [default: by --out's suffix, else text]", show_default=False
-        ),
+        typer.Option("--format", help="text, markdown or latex.", show_default="by the suffix of --out, else text"),
     ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", help="Write the table to this file (.md, .tex, .txt).", show_default=False)
@@ -59,8 +57,8 @@ def results(
 ) -> None:
     """The paper's tables from the result rows of runs: a row a method, a column a setting, beside the paper's figures.
 
-    Every cell is the accuracy with its 95% confidence interval; of a table with splits (modelnet40_ls, ...) the mean
-    over them. Rows that were not measured in the same way are refused, and the columns in which they differ are named.
+    A cell is the accuracy with its 95% confidence interval; of a table with splits (modelnet40_ls, ...) the mean.
+    Rows that were not measured in the same way are refused, and the columns in which they differ are named.
 
     Examples:
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -89,7 +88,7 @@ def _fault(row: ResultRow) -> str | None:
             return f"{name} is {value!r}"
     for name in ("accuracy", "ci95", "chance"):
         value = getattr(row, name)
-        if not isinstance(value, int | float) or not math.isfinite(value) or not 0 <= value <= 1:
+        if not isinstance(value, int | float) or not 0 <= value <= 1:
             return f"{name} is {value!r}"
     for name in ("method", "run", "table", "part", "classifier", "network"):
         if not isinstance(getattr(row, name), str):
