@@ -45,9 +45,6 @@ class EncoderEmbedder(Embedder):
         BadInput: the encoder fails, or returns something else than features, or features that depend on the batch.
     """
 
-    own_classifier: str
-    has_dense: bool
-
     def __init__(self, encoder: LoadedEncoder, sample: Tensor, *, mask: MaskChoice = "none") -> None:
         self.encoder = encoder
         self.image_size: int | None = None  # an encoder resizes by itself where it has to
@@ -55,7 +52,6 @@ class EncoderEmbedder(Embedder):
         together, alone = self._features(sample), self._features(sample[:1])
         _check_independence(together, alone, encoder.name)
         self.has_dense = together.dense is not None
-        self.has_own_mask = together.mask is not None
         if mask == "given" and not self.has_dense:
             what = f"{encoder.name} has pooled features only, which no mask can be applied to"
             raise UsageError(what, where="--encoder-mask given", remedy="Leave it out")
@@ -64,41 +60,39 @@ class EncoderEmbedder(Embedder):
         self.own_classifier = "local" if self.has_dense else "nearest"
 
     @torch.inference_mode()
-    def pooled(self, images: Tensor, masks: Tensor | None = None) -> Tensor:
-        """Images (B, 3, H, W) to raw vectors (B, D) float32; `masks` (B, H, W) as `cells` takes them."""
-        features = self._features(images)
+    def pooled(self, images: Tensor) -> Tensor:
+        """Images (B, 3, H, W) to raw vectors (B, D) float32; with `wants_masks`, as `cells` takes them."""
+        features, masks = self._features_and_masks(images)
         if features.pooled is not None:
             return features.pooled
         assert features.dense is not None
-        weights = self._mask_of(features, masks)
-        if weights is None:
+        if masks is None:
             return features.dense.mean((2, 3))
         # a view without foreground is the mean of all of its cells
-        weights = torch.where(weights.sum((1, 2), keepdim=True) > 0, weights, torch.ones_like(weights))
+        weights = torch.where(masks.sum((1, 2), keepdim=True) > 0, masks, torch.ones_like(masks))
         return (features.dense * weights[:, None]).sum((2, 3)) / weights.sum((1, 2))[:, None]
 
     @torch.inference_mode()
-    def cells(self, images: Tensor, masks: Tensor | None = None) -> list[ViewCells]:
-        """Images (B, 3, H, W) to descriptors on the grid.
-
-        Args:
-            images: float in [0, 1].
-            masks: (B, H, W), 1 = object; needed where `wants_masks`.
+    def cells(self, images: Tensor) -> list[ViewCells]:
+        """Images (B, 3, H, W) in [0, 1] to descriptors on the grid; with `wants_masks` (B, 4, H, W), the fourth
+        channel being the given mask, 1 = object.
 
         Raises:
             UsageError: the features are pooled.
         """
-        features = self._features(images)
+        features, masks = self._features_and_masks(images)
         if features.dense is None:
-            what = f"{self.encoder.name} has pooled features only, local matching needs dense ones"
-            raise UsageError(what, where="--classifier local", remedy="Use --classifier nearest, centroid or logistic")
-        norms = self._mask_of(features, masks)
-        if norms is None:
-            norms = torch.ones_like(features.dense[:, 0])
-        return [_view_cells(dense, norm) for dense, norm in zip(F.normalize(features.dense, dim=1), norms, strict=True)]
+            return super().cells(images)
+        norms = torch.ones_like(features.dense[:, 0]) if masks is None else masks
+        unit = F.normalize(features.dense, dim=1)
+        return [_view_cells(*view) for view in zip(unit, norms, strict=True)]
 
-    def classify(self, vectors: NDArray[np.float32], episodes: object) -> NDArray[np.int64]:
-        raise NotImplementedError("an encoder has none but the standard classifiers")
+    def _features_and_masks(self, images: Tensor) -> tuple[Features, Tensor | None]:
+        """Features, and foreground probabilities (B, h, w) of the cells where there are some."""
+        features = self._features(images[:, :3])
+        if not self.wants_masks or features.dense is None:
+            return features, features.mask
+        return features, F.interpolate(images[:, 3:], features.dense.shape[-2:], mode="area")[:, 0]
 
     def _features(self, images: Tensor) -> Features:
         try:
@@ -118,13 +112,6 @@ class EncoderEmbedder(Embedder):
             remedy = "The size of an image's features must not depend on the others of its batch"
             raise BadInput(what, where=f"--encoder {self.encoder.name}", remedy=remedy)
         return features
-
-    def _mask_of(self, features: Features, masks: Tensor | None) -> Tensor | None:
-        """Foreground probabilities (B, h, w) of the cells, or None."""
-        if not self.wants_masks:
-            return features.mask
-        assert masks is not None and features.dense is not None, "an embedder that wants masks is given some"
-        return F.interpolate(masks.float()[:, None], features.dense.shape[-2:], mode="area")[:, 0]
 
 
 def _view_cells(unit: Tensor, norms: Tensor) -> ViewCells:

@@ -118,6 +118,13 @@ def test_one_label_makes_one_line_of_runs_for_a_setting_each() -> None:
         table(row(run="a"), row(run="b"), a="same", b="same")
 
 
+def test_rows_that_cannot_be_in_one_table_are_refused() -> None:
+    with pytest.raises(UsageError, match=r"two protocols.*seed: 0 and 1"):
+        table(row(), row(method="rfs", run="r", seed=1))
+    with pytest.raises(UsageError, match="is there twice"):
+        table(row(), row())
+
+
 def test_a_label_for_no_run_is_refused() -> None:
     with pytest.raises(UsageError, match=r"no run 'nope' \(there are: a, b\)"):
         table(row(run="a"), row(run="b"), nope="x")
