@@ -28,12 +28,14 @@ class Embedder(ABC):
         own_classifier: what `--classifier auto` means: local, centroid, nearest, logistic, cl2n or attention.
         has_dense: whether `cells` can be asked for, so that "local" may be chosen.
         image_size: side in pixels that views are resized to; None: as they are.
+        wants_masks: whether `pooled` and `cells` take the views' own masks (B, H, W) bool as a second argument.
     """
 
     name: str
     own_classifier: str
     has_dense: bool = False
     image_size: int | None = None
+    wants_masks: bool = False
 
     @abstractmethod
     def pooled(self, images: Tensor) -> Tensor:

@@ -28,7 +28,8 @@ class ResultRow:
     network: str
     """"trained", or "untrained" for the same network with random weights."""
     classifier: str
-    """local (1-NN by local matching) or centroid (nearest mean of pooled descriptors)."""
+    """local (1-NN by local matching); of pooled features centroid (nearest class mean), nearest (1-NN) or logistic
+    (regression); or the method's own: cl2n, attention."""
     classes: str
     """category or instance."""
     ways: int
@@ -73,6 +74,16 @@ class ResultRow:
     """Of the training run (trained) or of the network's settings (untrained)."""
     evaluation_hash: str
     """Of the evaluation's settings other than those above."""
+    method: str = "dope"
+    """What made the features: a method of `dope train`, or an encoder's label."""
+    run: str = ""
+    """Name of the run's folder, which tells runs of one method apart; empty where there is no run."""
+    table: str = ""
+    """Table of splits (modelnet40_ls, shapenet55_ls, co3d_ls, or the name of a --split-file); empty without one."""
+    table_split: int = -1
+    """Which of its splits, from 0; -1 without a table."""
+    part: str = "all"
+    """Classes of that split: test or val; all without a table."""
 
     @property
     def protocol(self) -> str:
