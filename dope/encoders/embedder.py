@@ -60,39 +60,44 @@ class EncoderEmbedder(Embedder):
         self.own_classifier = "local" if self.has_dense else "nearest"
 
     @torch.inference_mode()
-    def pooled(self, images: Tensor) -> Tensor:
-        """Images (B, 3, H, W) to raw vectors (B, D) float32; with `wants_masks`, as `cells` takes them."""
-        features, masks = self._features_and_masks(images)
+    def pooled(self, images: Tensor, masks: Tensor | None = None) -> Tensor:
+        """Images (B, 3, H, W) to raw vectors (B, D) float32; `masks` as for `cells`."""
+        features, norms = self._features_and_masks(images, masks)
         if features.pooled is not None:
             return features.pooled
         assert features.dense is not None
-        if masks is None:
+        if norms is None:
             return features.dense.mean((2, 3))
         # a view without foreground is the mean of all of its cells
-        weights = torch.where(masks.sum((1, 2), keepdim=True) > 0, masks, torch.ones_like(masks))
+        weights = torch.where(norms.sum((1, 2), keepdim=True) > 0, norms, torch.ones_like(norms))
         return (features.dense * weights[:, None]).sum((2, 3)) / weights.sum((1, 2))[:, None]
 
     @torch.inference_mode()
-    def cells(self, images: Tensor) -> list[ViewCells]:
-        """Images (B, 3, H, W) in [0, 1] to descriptors on the grid; with `wants_masks` (B, 4, H, W), the fourth
-        channel being the given mask, 1 = object.
+    def cells(self, images: Tensor, masks: Tensor | None = None) -> list[ViewCells]:
+        """Images (B, 3, H, W) in [0, 1] to descriptors on the grid.
+
+        Args:
+            images: the views.
+            masks: their own masks (B, H, W) bool, where `wants_masks`.
 
         Raises:
             UsageError: the features are pooled.
         """
-        features, masks = self._features_and_masks(images)
+        features, norms = self._features_and_masks(images, masks)
         if features.dense is None:
             return super().cells(images)
-        norms = torch.ones_like(features.dense[:, 0]) if masks is None else masks
+        norms = torch.ones_like(features.dense[:, 0]) if norms is None else norms
         unit = F.normalize(features.dense, dim=1)
         return [_view_cells(*view) for view in zip(unit, norms, strict=True)]
 
-    def _features_and_masks(self, images: Tensor) -> tuple[Features, Tensor | None]:
+    def _features_and_masks(self, images: Tensor, masks: Tensor | None) -> tuple[Features, Tensor | None]:
         """Features, and foreground probabilities (B, h, w) of the cells where there are some."""
-        features = self._features(images[:, :3])
+        features = self._features(images)
         if not self.wants_masks or features.dense is None:
             return features, features.mask
-        return features, F.interpolate(images[:, 3:], features.dense.shape[-2:], mode="area")[:, 0]
+        assert masks is not None, "an embedder that wants masks is given some"
+        given = masks.to(images.device).float()[:, None]
+        return features, F.interpolate(given, features.dense.shape[-2:], mode="area")[:, 0]
 
     def _features(self, images: Tensor) -> Features:
         try:

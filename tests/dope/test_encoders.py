@@ -204,11 +204,6 @@ def test_pooled_features_stay_raw_and_have_no_cells() -> None:
         embedder(lambda images: images.mean((2, 3)), mask="given")
 
 
-def with_masks(masks: Tensor) -> Tensor:
-    """Views as they come where given masks are wanted."""
-    return torch.cat([IMAGES, masks[:, None]], 1)
-
-
 def as_map(cells: Any) -> Tensor:
     return cells.at(np.arange(len(cells))).T.unflatten(1, cells.grid)
 
@@ -234,19 +229,21 @@ def test_without_a_mask_every_cell_is_foreground() -> None:
 
 
 def test_given_masks_are_shrunk_by_area_and_take_the_place_of_the_encoders() -> None:
-    masks = torch.zeros(3, 16, 16)
-    masks[:, :4, :6] = 1  # covers cell (0, 0), and half of cell (0, 1)
+    masks = torch.zeros(3, 16, 16, dtype=torch.bool)
+    masks[:, :4, :6] = True  # covers cell (0, 0), and half of cell (0, 1)
     found = embedder(lambda images: (dense(images), torch.full((len(images), 4, 4), 0.3)), mask="given")
     assert found.wants_masks and found.name == "m:f + given masks"
-    cells = found.cells(with_masks(masks))[0]
+    cells = found.cells(IMAGES, masks)[0]
     assert cells.norm_map[0].tolist() == [1, 0.5, 0, 0] and not cells.norm_map[1:].any()
     maps = dense(IMAGES)
-    torch.testing.assert_close(found.pooled(with_masks(masks)), (maps[:, :, 0, 0] + 0.5 * maps[:, :, 0, 1]) / 1.5)
+    torch.testing.assert_close(found.pooled(IMAGES, masks), (maps[:, :, 0, 0] + 0.5 * maps[:, :, 0, 1]) / 1.5)
 
 
 def test_a_view_whose_mask_is_empty_is_pooled_over_all_cells() -> None:
     found = embedder(dense, mask="given")
-    torch.testing.assert_close(found.pooled(with_masks(torch.zeros(3, 16, 16))), dense(IMAGES).mean((2, 3)))
+    torch.testing.assert_close(
+        found.pooled(IMAGES, torch.zeros(3, 16, 16, dtype=torch.bool)), dense(IMAGES).mean((2, 3))
+    )
 
 
 def test_an_encoders_own_pooled_features_are_used() -> None:
