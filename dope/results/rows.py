@@ -51,15 +51,13 @@ def lines_of(found: Sequence[FoundRow], labels: Mapping[str, str], *, by_step: b
     networks: dict[tuple[object, ...], list[FoundRow]] = defaultdict(list)
     for item in found:
         row = item.row
-        key = (row.method, row.run or str(item.run), row.config_hash, row.network, row.classifier)
-        networks[key].append(item)
+        networks[(row.method, _trained_once(item), row.config_hash, row.network, row.classifier)].append(item)
     _check_labels(labels, found)
     parts = [part for items in networks.values() for part in (_by_checkpoint(items) if by_step else [items])]
-    named = _names(parts, labels)
-    lines: dict[str, list[FoundRow]] = defaultdict(list)
-    for name, items in zip(named, parts, strict=True):
-        lines[name] += items
-    made = [_line(name, items) for name, items in lines.items()]
+    lines: dict[tuple[str, int], list[FoundRow]] = defaultdict(list)
+    for i, (name, given, items) in enumerate(zip(*_names(parts, labels), parts, strict=True)):
+        lines[name, -1 if given else i] += items  # only the user can make one line of several
+    made = [_line(name, items) for (name, _), items in lines.items()]
     if by_step:
         for line in made:
             _check_cells(line)
@@ -79,6 +77,12 @@ def columns_of(found: Sequence[FoundRow]) -> list[tuple[int, int]]:
     return sorted({(item.row.ways, item.row.shots) for item in found})
 
 
+def _trained_once(item: FoundRow) -> str:
+    """What rows of one run have in common; an encoder, which has no run and no steps, is known by its hash."""
+    row = item.row
+    return row.run or (str(item.run) if row.step is not None else str(row.checkpoint_sha256))
+
+
 def _by_checkpoint(items: list[FoundRow]) -> list[list[FoundRow]]:
     """The rows apart by their step where a cell has several, else together."""
     if max(Counter(cell_of(item.row) for item in items).values()) == 1:
@@ -91,7 +95,7 @@ def _by_checkpoint(items: list[FoundRow]) -> list[list[FoundRow]]:
 
 @dataclass(frozen=True)
 class _Facts:
-    """What may tell a line from others, in words; `folder` and `settings` are the last resort."""
+    """What may tell a line from others, in words; from `folder` on the last resort."""
 
     base: str
     given: bool
@@ -101,23 +105,25 @@ class _Facts:
     step: str
     folder: str
     settings: str
+    weights: str
 
 
-def _names(parts: Sequence[Sequence[FoundRow]], labels: Mapping[str, str]) -> list[str]:
-    """A label for each part: no longer than needed to tell it from the others."""
+def _names(parts: Sequence[Sequence[FoundRow]], labels: Mapping[str, str]) -> tuple[list[str], list[bool]]:
+    """A label for each part, no longer than needed to tell it from the others; and whether the user gave it."""
     facts = [_facts(part, labels) for part in parts]
     details = [_details(fact, [other for other in facts if other.base == fact.base]) for fact in facts]
-    for last_resort in ("folder", "settings"):
-        names = [(fact.base, *more) for fact, more in zip(facts, details, strict=True)]
-        alike = [i for i, name in enumerate(names) if names.count(name) > 1 and not facts[i].given]
+    for last_resort in ("folder", "settings", "weights"):
+        keys = [(fact.base, *more) for fact, more in zip(facts, details, strict=True)]
+        alike = [i for i, name in enumerate(keys) if keys.count(name) > 1 and not facts[i].given]
         for i in alike:
-            same = {getattr(facts[j], last_resort) for j in alike if names[j] == names[i]}
+            same = {getattr(facts[j], last_resort) for j in alike if keys[j] == keys[i]}
             if len(same) > 1:
                 details[i] = [*details[i], getattr(facts[i], last_resort)]
-    return [
+    names = [
         legible(f"{fact.base} ({', '.join(more)})" if more else fact.base)
         for fact, more in zip(facts, details, strict=True)
     ]
+    return names, [fact.given for fact in facts]
 
 
 def _facts(part: Sequence[FoundRow], labels: Mapping[str, str]) -> _Facts:
@@ -132,6 +138,7 @@ def _facts(part: Sequence[FoundRow], labels: Mapping[str, str]) -> _Facts:
         step="" if row.step is None or len({item.row.step for item in part}) > 1 else f"step {row.step:,}",
         folder=str(item.run),
         settings=f"settings {row.config_hash[:8]}",
+        weights=f"weights {str(row.checkpoint_sha256)[:8]}",
     )
 
 

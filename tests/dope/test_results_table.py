@@ -110,6 +110,14 @@ def test_runs_of_one_name_in_two_folders_are_told_apart_by_their_folders() -> No
     assert list(measured(labelled)) == ["ours", "DOPE"]
 
 
+def test_an_encoder_is_one_line_wherever_its_rows_lie() -> None:
+    encoder = {"method": "m:f", "run": "", "step": None, "network": "encoder"}
+    there, here = found(row(**encoder), folder="x"), found(row(shots=5, **encoder), folder="y")
+    assert list(measured(build_table([*there, *here], beside="none"))) == ["m:f"]
+    other = found(row(shots=5, **{**encoder, "checkpoint_sha256": "bb"}), folder="x")
+    assert list(measured(build_table([*there, *other], beside="none"))) == ["m:f (weights aa)", "m:f (weights bb)"]
+
+
 def test_one_label_makes_one_line_of_runs_for_a_setting_each() -> None:
     rows = [row(0.5, method="feat", run="f1"), row(0.7, method="feat", run="f5", shots=5, config_hash="d")]
     cells = measured(table(*rows, f1="FEAT", f5="FEAT"))["FEAT"]
