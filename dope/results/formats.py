@@ -61,7 +61,7 @@ def as_latex(table: ResultsTable) -> str:
     left = _left_columns(table)
     drawn = [
         r"\begin{table}",
-        r"  \centering",
+        r"  \centering\footnotesize\setlength{\tabcolsep}{4pt}",
         rf"  \caption{{{_tex(table.title)}. {_tex(_caption(table, 'Bold'))}}}",
         rf"  \begin{{tabular}}{{{'l' * left}{'r' * (len(header) - left)}}}",
         r"    \toprule",
@@ -118,7 +118,7 @@ def _interval(cell: Cell) -> str:
 
 
 def _of_splits(cell: Cell, n_splits: int) -> str:
-    return f" ({len(cell.splits)} of {n_splits} splits)" if cell.missing else ""
+    return f" ({len(cell.splits)}/{n_splits})" if cell.missing else ""
 
 
 def _pipes(fields: Sequence[str]) -> str:

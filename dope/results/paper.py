@@ -51,7 +51,7 @@ def paper_rows(table: str) -> list[PaperRow]:
         return []
     rows = []
     for row in _paper()["tables"][table]["rows"]:
-        trained_on = f", trained on {row['trained_on']}" if "trained_on" in row else ""
+        trained_on = f" - {row['trained_on']}" if "trained_on" in row else ""
         rows.append(PaperRow(method_name(row["method"]) + trained_on, row["method"], _by_column(row["accuracy"])))
     return rows
 

@@ -103,7 +103,7 @@ def build_table(
     if not with_classifier and (name := next(iter(classifiers))):
         caption.append(f"Classifier: {name}.")
     if len(blocks) > 1:
-        caption.append(f"The paper's figures: {paper.source()}; its runs, not ours.")
+        caption.append(f"In the paper ({paper.source()}): its own runs, not ours; - ABC: trained on ABC.")
     return ResultsTable(_title(found), names, tuple(blocks), tuple(caption), n_splits, with_classifier)
 
 
@@ -195,8 +195,9 @@ def _reading(lines: Sequence[TableLine], n_splits: int, table: str) -> list[str]
     cells = [cell for line in lines for cell in line.cells if cell is not None]
     sentences = []
     if table:
-        whole = f"Means over the {n_splits} splits of {paper.table_title(table)} (of accuracies and of intervals)"
-        sentences.append(whole + ("; cells of fewer splits say so." if any(cell.missing for cell in cells) else "."))
+        sentences.append(f"Means over the {n_splits} splits of {paper.table_title(table)} (of accuracies, of intervals).")
+        for n in sorted({len(cell.splits) for cell in cells if cell.missing}):
+            sentences.append(f"({n}/{n_splits}): {n} of {n_splits} splits only.")
     if len(lines) > 1:
         # "{best}" is what a format marks the best by
         if any(cell.best for cell in cells):
