@@ -9,12 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tiny_views import write_views
 from torch import Tensor, nn
 
+from dope.commands.places import run_and_shards
 from dope.common.errors import BadInput, UsageError
 from dope.encoders.embedder import EncoderEmbedder
 from dope.encoders.features import read_features
 from dope.encoders.load import LoadedEncoder, load_encoder
+from dope.encoders.on_shards import default_folder, encoder_on_shards
 
 SOURCE = """
 import torch
@@ -255,3 +258,28 @@ def test_an_encoders_own_pooled_features_are_used() -> None:
 def test_half_precision_is_read_as_float32() -> None:
     found = embedder(lambda images: dense(images).half())
     assert found.pooled(IMAGES).dtype == found.cells(IMAGES)[0].descriptors(0, 2).dtype == torch.float32
+
+
+def test_run_and_shards_or_shards_and_encoder() -> None:
+    assert run_and_shards(["run", "shards"], None) == (Path("run"), "shards")
+    assert run_and_shards(["s3://bucket/shards"], "m:f") == (None, "s3://bucket/shards")
+    for places, encoder, message in [
+        (["shards"], None, "shards: RUN and SHARDS are needed, here is one of them.*--encoder"),
+        (["a", "b", "c"], None, "here are 3 arguments"),
+        (["run", "shards"], "m:f", "--encoder m:f: a run and an encoder are given. Leave out run"),
+        (["a", "b", "c"], "m:f", "SHARDS alone is needed, here are 3 arguments"),
+    ]:
+        with pytest.raises(UsageError, match=message):
+            run_and_shards(places, encoder)
+
+
+def test_rows_of_an_encoder_say_which_one(module: str, tmp_path: Path) -> None:
+    shards = write_views(tmp_path / "shards", objects=2)
+    found, columns = encoder_on_shards(f"{module}:Net", shards, mask="given")
+    assert found.wants_masks and columns["method"] == f"{module}:Net + given masks"
+    assert columns["checkpoint_sha256"] == hashlib.sha256(Path(f"{module}.py").read_bytes()).hexdigest()
+    assert columns["config_hash"] and (columns["run"], columns["step"]) == ("", None)
+    folders = [default_folder(name) for name in ("hf:models/x?pool=cls", "m:f + given masks", "../:", "...")]
+    assert [str(folder) for folder in folders] == [
+        "eval/hf_models_x_pool_cls", "eval/m_f_+_given_masks", "eval/encoder", "eval/encoder"
+    ]  # fmt: skip
