@@ -53,6 +53,8 @@ def results_file(path: Path) -> Path:
         return path
     if not path.exists():
         raise BadInput("no such run or file", where=path, remedy="`dope eval RUN SHARDS` writes RUN/eval")
+    if not path.is_dir():
+        raise BadInput("is neither a folder nor a file", where=path)
     for folder in (path, path / "eval"):
         for name in NAMES:
             if (folder / name).is_file():

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -39,6 +40,7 @@ def test_a_file_named_twice_is_refused(tmp_path: Path, twice: str) -> None:
     ("make", "message"),
     [
         (lambda folder: None, "no such run or file"),
+        (os.mkfifo, "neither a folder nor a file"),
         (lambda folder: folder.mkdir(), r"holds neither eval/results.parquet nor results.parquet"),
         (lambda folder: (folder / "checkpoints").mkdir(parents=True), "has not been evaluated.*dope eval"),
         (lambda folder: write_run(folder / "inner", row()), r"1 of its folders do \(inner\)\. Name .*/\*"),
