@@ -195,7 +195,7 @@ def _reading(lines: Sequence[TableLine], n_splits: int, table: str) -> list[str]
     cells = [cell for line in lines for cell in line.cells if cell is not None]
     sentences = []
     if table:
-        sentences.append(f"Means over the {n_splits} splits of {paper.table_title(table)} (of accuracies, of intervals).")
+        sentences.append(f"Means over the {n_splits} splits of {paper.table_title(table)} (of both).")
         for n in sorted({len(cell.splits) for cell in cells if cell.missing}):
             sentences.append(f"({n}/{n_splits}): {n} of {n_splits} splits only.")
     if len(lines) > 1:
