@@ -12,13 +12,13 @@ from dope.lowshot.results import ResultRow
 from dope.results.sources import FoundRow
 
 SHARED = (
-    "table", "part", "split", "dataset", "classes", "shot_mode", "episodes", "seed", "evaluation_hash",
+    "table", "part", "split", "dataset", "classes", "shot_mode", "episodes", "seed",
 )  # fmt: skip
 """Columns that are equal in all rows of a table."""
 SHARED_IN_COLUMN = ("queries",)
 """Columns that are equal for one (ways, shots): `--fit` may have reduced the queries of 5-shot episodes alone."""
-SHARED_IN_CELL = ("n_classes", "n_objects", "n_views")
-"""Columns that are equal for one (ways, shots) of one table split."""
+SHARED_IN_CELL = ("n_classes", "n_objects", "n_views", "evaluation_hash")
+"""Columns that are equal for one (ways, shots) of one table split, whose categories are part of the hash."""
 MEANINGS = {
     "evaluation_hash": "categories, image size or matching",
     "dataset": "fingerprint of the views",
@@ -38,6 +38,7 @@ def check_one_protocol(found: Sequence[FoundRow]) -> None:
     _check_groups(found, SHARED, lambda row: ())
     _check_groups(found, SHARED_IN_COLUMN, lambda row: (row.ways, row.shots))
     _check_groups(found, SHARED_IN_CELL, lambda row: (row.ways, row.shots, row.table_split))
+    _check_groups([item for item in found if not item.row.table], ("evaluation_hash",), lambda row: ())
 
 
 def check_no_duplicates(found: Sequence[FoundRow]) -> None:
