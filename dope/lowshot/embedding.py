@@ -65,7 +65,7 @@ class Embedder(ABC):
 
 
 class DopeEmbedder(Embedder):
-    """Dense descriptors of a `DopeNetwork` in eval mode; pooled, their mean over the grid, weighted by the soft mask."""
+    """Dense descriptors of a `DopeNetwork` in eval mode; pooled: their mean, weighted by the soft mask."""
 
     name = "dope"
     own_classifier = "local"
