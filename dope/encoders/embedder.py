@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import Literal
 
-import numpy as np
 import torch
 import torch.nn.functional as F
-from numpy.typing import NDArray
 from torch import Tensor
 
 from dope.common.errors import BadInput, DopeError, UsageError
@@ -87,8 +85,8 @@ class EncoderEmbedder(Embedder):
         if features.dense is None:
             return super().cells(images)
         norms = torch.ones_like(features.dense[:, 0]) if norms is None else norms
-        unit = F.normalize(features.dense, dim=1)
-        return [_view_cells(*view) for view in zip(unit, norms, strict=True)]
+        descriptors = F.normalize(features.dense, dim=1) * norms[:, None]
+        return [ViewCells.of_grid(view) for view in descriptors.permute(0, 2, 3, 1)]
 
     def _features_and_masks(self, images: Tensor, masks: Tensor | None) -> tuple[Features, Tensor | None]:
         """Features, and foreground probabilities (B, h, w) of the cells where there are some."""
@@ -117,19 +115,6 @@ class EncoderEmbedder(Embedder):
             remedy = "The size of an image's features must not depend on the others of its batch"
             raise BadInput(what, where=f"--encoder {self.encoder.name}", remedy=remedy)
         return features
-
-
-def _view_cells(unit: Tensor, norms: Tensor) -> ViewCells:
-    """Unit vectors (D, h, w) and norms (h, w) of one view as cells sorted by falling norm."""
-    sorted_norms, order = norms.flatten().sort(descending=True, stable=True)
-    descriptors = (unit.flatten(1).T[order] * sorted_norms[:, None]).contiguous()
-    grid = (unit.shape[1], unit.shape[2])
-    nothing_left = descriptors[:0]
-    return ViewCells(grid, order.cpu().numpy(), sorted_norms.cpu().numpy(), descriptors, nothing_left, _all_described)
-
-
-def _all_described(features: Tensor, norms: NDArray[np.float32]) -> Tensor:
-    return features
 
 
 def _check_independence(together: Features, alone: Features, name: str) -> None:

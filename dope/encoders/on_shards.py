@@ -1,17 +1,17 @@
-"""An encoder made ready for the views of a folder of shards, and the columns of its result rows."""
+"""An encoder made ready for the views of a folder of shards, and what its result rows say of it."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
 from dope.encoders.embedder import EncoderEmbedder, MaskChoice
-from dope.encoders.load import LoadedEncoder, load_encoder
+from dope.encoders.load import load_encoder
 from dope.lowshot.encoding import to_tensor
+from dope.lowshot.subjects import Subject, encoder_subject
 from dope.lowshot.views import ViewShards
 from dope.storage import Shards
 
@@ -21,7 +21,7 @@ SAMPLE = 4
 
 def encoder_on_shards(
     text: str, shards: Shards, *, mask: MaskChoice = "none", device: torch.device | str = "cpu"
-) -> tuple[EncoderEmbedder, dict[str, Any]]:
+) -> Subject:
     """Load `--encoder TEXT`, try it on a few views, and give it with the columns that say which encoder it is.
 
     Raises:
@@ -32,20 +32,7 @@ def encoder_on_shards(
     some = np.unique(np.linspace(0, len(views) - 1, SAMPLE).astype(np.int64))
     (images,) = views.batches(some, SAMPLE)
     embedder = EncoderEmbedder(encoder, to_tensor(images, device), mask=mask)
-    return embedder, encoder_columns(encoder, embedder.name)
-
-
-def encoder_columns(encoder: LoadedEncoder, name: str) -> dict[str, Any]:
-    """Columns of result rows: there is no run, and nothing was trained here."""
-    return {
-        "method": name,
-        "run": "",
-        "network": "encoder",
-        "checkpoint": encoder.name,
-        "checkpoint_sha256": encoder.sha256 or None,
-        "step": None,
-        "config_hash": encoder.config_hash,
-    }
+    return encoder_subject(embedder, label=encoder.name, sha256=encoder.sha256 or None, config_hash=encoder.config_hash)
 
 
 def default_folder(name: str) -> Path:

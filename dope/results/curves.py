@@ -87,7 +87,9 @@ def plot_curves(found: Sequence[FoundRow], path: Path, labels: Mapping[str, str]
     order = [*names, "chance"]
     figure.suptitle(_title(found, [curve for panel in curves.values() for curve in panel]), fontsize=12)
     figure.tight_layout(rect=(0, 0.24 * legend_rows / figure.get_figheight(), 1, 1))
-    figure.legend([handles[name] for name in order], order, loc="lower center", ncols=2, frameon=False, fontsize=9, handlelength=3)
+    figure.legend(
+        [handles[name] for name in order], order, loc="lower center", ncols=2, frameon=False, fontsize=9, handlelength=3
+    )
     with files.atomic_path(path) as partial:
         figure.savefig(partial)
     return path

@@ -92,11 +92,12 @@ def _refusal(one: FoundRow, other: FoundRow, names: Sequence[str]) -> UsageError
     told = []
     for name in names:
         meaning = f" ({MEANINGS[name]})" if name in MEANINGS else ""
-        values = (as_text(getattr(item.row, name)) or "''" for item in (one, other))
-        told.append(f"{name}{meaning}: {' and '.join(values)}")
+        both = (as_text(getattr(item.row, name)) or "''" for item in (one, other))
+        told.append(f"{name}{meaning}: {' and '.join(both)}")
     what = f"rows of two protocols are not mixed: {_both(one, other)} differ in {'; '.join(told)}"
     name = next((name for name in ("part", "table") if name in names), names[0])
-    value = as_text(getattr(one.row, name))
+    values = [as_text(getattr(item.row, name)) for item in (one, other)]
+    value = "test" if name == "part" and "test" in values else values[0]
     flag = f"--part {value}" if name == "part" else f"--only {name}={value}"
     separately = " or show each file by a command of its own" if one.file != other.file else ""
     return UsageError(what, remedy=f"Choose by {flag}{separately}")

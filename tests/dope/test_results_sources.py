@@ -74,7 +74,7 @@ def test_a_row_edited_by_hand_is_not_believed(tmp_path: Path, column: str, value
     [
         ("episodes", (2500, 100)), ("queries", (15, 14)), ("seed", (0, 1)), ("classes", ("category", "instance")),
         ("shot_mode", ("several_instances", "one_instance")), ("dataset", ("aaaa", "bbbb")),
-        ("part", ("test", "val")), ("split", ("all", "val")), ("table", ("modelnet40_ls", "co3d_ls")),
+        ("part", ("val", "test")), ("split", ("all", "val")), ("table", ("modelnet40_ls", "co3d_ls")),
         ("evaluation_hash", ("e1", "e2")), ("n_objects", (100, 101)),
     ],
 )  # fmt: skip
