@@ -70,14 +70,16 @@ def results(
     """
     from dope.results.formats import SUFFIXES, write_table
     from dope.results.one_protocol import keep_only
+    from dope.results.rows import read_labels
     from dope.results.sources import find_rows
     from dope.results.table import build_table
 
     form = form or (SUFFIXES.get(out.suffix.lower(), "text") if out else "text")
     check_choice(form, "--format", FORMATS)
     check_choice(paper, "--paper", BESIDE)
-    labels, wanted = _pairs(label, "--label", "RUN=TEXT"), _pairs(only, "--only", "COLUMN=VALUE")
-    found = keep_only(find_rows(runs), {**wanted, **({"part": part} if part is not None else {})})
+    wanted = _columns(only) | ({"part": part} if part is not None else {})
+    found = keep_only(find_rows(runs), wanted)
+    labels = read_labels(label or (), found)
     text = write_table(build_table(found, labels=labels, beside=paper), form)  # type: ignore[arg-type]
     if plot is not None:
         from dope.results.curves import plot_curves
@@ -94,15 +96,16 @@ def results(
         typer.echo(f"curves in {plot}", err=out is None)
 
 
-def _pairs(values: list[str] | None, flag: str, form: str) -> dict[str, str]:
+def _columns(values: list[str] | None) -> dict[str, str]:
+    """column -> value of --only."""
     from dope.common.errors import UsageError
 
-    pairs: dict[str, str] = {}
+    columns: dict[str, str] = {}
     for value in values or []:
         name, equals, text = value.partition("=")
-        if not equals or not name or (flag == "--label" and not text.strip()):
-            raise UsageError(f"'{value}' is not {form}", where=flag)
-        if name in pairs:
-            raise UsageError(f"'{name}' is given twice", where=flag)
-        pairs[name] = text
-    return pairs
+        if not equals or not name:
+            raise UsageError(f"'{value}' is not COLUMN=VALUE", where="--only")
+        if name in columns:
+            raise UsageError(f"'{name}' is given twice", where="--only")
+        columns[name] = text
+    return columns

@@ -100,7 +100,7 @@ class EncoderEmbedder(Embedder):
     def _features(self, images: Tensor) -> Features:
         try:
             with torch.inference_mode():
-                output = self.encoder.encode(images)
+                output = self.encoder.encode(images.clone())  # which it may change, as by images.sub_(mean)
         except DopeError:
             raise
         except Exception as error:  # whatever somebody else's code raises

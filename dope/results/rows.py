@@ -64,6 +64,26 @@ def lines_of(found: Sequence[FoundRow], labels: Mapping[str, str], *, by_step: b
     return made
 
 
+def read_labels(values: Sequence[str], found: Sequence[FoundRow]) -> dict[str, str]:
+    """`--label RUN=TEXT`, where RUN is a run's name or folder or a method, which may contain "=": hf:FOLDER?pool=cls.
+
+    Raises:
+        UsageError: not of this form, of no run, or two labels of one.
+    """
+    known = {name for item in found for name in _handles(item)}
+    labels: dict[str, str] = {}
+    for value in values:
+        names = [name for name in known if value.startswith(f"{name}=")] or [value.partition("=")[0]]
+        name = max(names, key=len)
+        text = value.removeprefix(name).removeprefix("=")
+        if not name or not text.strip():
+            raise UsageError(f"'{value}' is not RUN=TEXT", where="--label")
+        if name in labels:
+            raise UsageError(f"'{name}' is given twice", where="--label")
+        labels[name] = text
+    return labels
+
+
 def cell_of(row: ResultRow) -> tuple[int, int, int]:
     return row.ways, row.shots, row.table_split
 

@@ -257,6 +257,13 @@ def test_an_encoders_own_pooled_features_are_used() -> None:
     assert found.has_dense and found.cells(IMAGES)[0].dim == 3
 
 
+def test_an_encoder_may_change_its_images_in_place() -> None:
+    before = IMAGES.clone()
+    found = embedder(lambda images: images.sub_(0.5).mean((2, 3)))
+    torch.testing.assert_close(found.pooled(IMAGES), before.mean((2, 3)) - 0.5)
+    assert torch.equal(IMAGES, before)
+
+
 def test_half_precision_is_read_as_float32() -> None:
     found = embedder(lambda images: dense(images).half())
     assert found.pooled(IMAGES).dtype == found.cells(IMAGES)[0].descriptors(0, 2).dtype == torch.float32

@@ -53,14 +53,23 @@ def test_labels_parts_and_columns_are_chosen(tmp_path: Path) -> None:
     assert "x=1" in said and "ours" in said and "40.00" not in said and "90.00" not in said
 
 
+def test_names_may_contain_an_equals_sign(tmp_path: Path) -> None:
+    rows = [row(method=f"hf:x?pool={pool}", run="", step=None, checkpoint_sha256=pool) for pool in ("cls", "mean")]
+    said = run_command(write_run(tmp_path / "a", *rows), "--label", "hf:x?pool=cls=CLS=1")
+    assert "\nCLS=1 " in said and "hf:x?pool=mean" in said and "pool=cls" not in said
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (("--format", "html"), "--format: 'html' is not one of text, markdown, latex"),
         (("--paper", "some"), "--paper: 'some' is not one of"),
+        (("--label", "=x"), "'=x' is not RUN=TEXT"),
+        (("--label", "nope=x"), "--label nope=...: no run 'nope'"),
         (("--label", "run"), "--label: 'run' is not RUN=TEXT"),
         (("--label", "run= "), "--label: 'run= ' is not RUN=TEXT"),
         (("--label", "run=a", "--label", "run=b"), "'run' is given twice"),
+        (("--only", "seed=0", "--only", "seed=1"), "--only: 'seed' is given twice"),
         (("--only", "episodes"), "--only: 'episodes' is not COLUMN=VALUE"),
         (("--plot", "curve.jpg"), r"--plot curve.jpg: plots are .png, .pdf, .svg"),
     ],
