@@ -10,6 +10,7 @@ Names are matched to the categories of shards ignoring case, underscores, hyphen
 from __future__ import annotations
 
 import difflib
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,6 +69,7 @@ def read_split_file(path: Path) -> SplitTable:
     values = files.read_json(path, remedy=FORMAT)
     if not isinstance(values, dict) or ("splits" not in values and "val_test" not in values):
         raise BadInput("is no table of splits", where=path, remedy=FORMAT)
+    _refuse_doubled_keys(path)
     table = _of_paper(values, path) if "val_test" in values else _of_user(values, path)
     _check(table, path)
     return table
@@ -142,6 +144,20 @@ def _of_paper(values: Mapping[str, Any], path: Path) -> SplitTable:
         for number in range(n_splits)
     )
     return SplitTable(path.stem, tuple(base), splits)
+
+
+def _refuse_doubled_keys(path: Path) -> None:
+    """JSON of which readers forget the first of two equal keys in silence."""
+
+    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        seen: set[str] = set()
+        for key, _ in pairs:
+            if key in seen:
+                raise BadInput(f"'{key}' is there twice", where=path, remedy="Name every class once")
+            seen.add(key)
+        return dict(pairs)
+
+    json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=once)
 
 
 def _names(value: Any, what: str, path: Path) -> tuple[str, ...]:
