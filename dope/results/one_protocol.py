@@ -15,10 +15,9 @@ SHARED = (
     "table", "part", "split", "dataset", "classes", "shot_mode", "episodes", "seed",
 )  # fmt: skip
 """Columns that are equal in all rows of a table."""
-SHARED_IN_COLUMN = ("queries",)
-"""Columns that are equal for one (ways, shots): `--fit` may have reduced the queries of 5-shot episodes alone."""
-SHARED_IN_CELL = ("n_classes", "n_objects", "n_views", "evaluation_hash")
-"""Columns that are equal for one (ways, shots) of one table split, whose categories are part of the hash."""
+SHARED_IN_CELL = ("queries", "n_classes", "n_objects", "n_views", "evaluation_hash")
+"""Columns that are equal for one (ways, shots) of one table split: `--fit` may have reduced the queries of some, and
+the categories, which each split has its own of, are part of the hash."""
 MEANINGS = {
     "evaluation_hash": "categories, image size or matching",
     "dataset": "fingerprint of the views",
@@ -36,7 +35,8 @@ def check_one_protocol(found: Sequence[FoundRow]) -> None:
         UsageError: names two files, the columns in which they differ and their values, and how to choose.
     """
     _check_groups(found, SHARED, lambda row: ())
-    _check_groups(found, SHARED_IN_COLUMN, lambda row: (row.ways, row.shots))
+    as_asked = [item for item in found if item.row.queries == item.row.asked_queries]
+    _check_groups(as_asked, ("queries",), lambda row: ())
     _check_groups(found, SHARED_IN_CELL, lambda row: (row.ways, row.shots, row.table_split))
     _check_groups([item for item in found if not item.row.table], ("evaluation_hash",), lambda row: ())
 

@@ -167,11 +167,10 @@ def _title(found: Sequence[FoundRow]) -> str:
 def _what_all_share(found: Sequence[FoundRow]) -> str:
     """The protocol in a sentence."""
     row = found[0].row
-    queries = {column_name(item.row.ways, item.row.shots): item.row.queries for item in found}
-    if len(set(queries.values())) == 1:
-        asked = f"{row.queries} queries a class"
-    else:
-        asked = "queries a class: " + ", ".join(f"{n} in {name}" for name, n in queries.items())
+    queries = sorted({item.row.queries for item in found})
+    asked = f"{queries[-1]} queries a class"
+    if len(queries) > 1:
+        asked += f" (as few as {queries[0]} where there are not enough objects)"
     said = [f"{row.episodes:,} episodes a setting (seed {row.seed})", asked]
     if any(item.row.shots > 1 for item in found):
         said.append("shots of several objects" if row.shot_mode == "several_instances" else "shots of one object")

@@ -94,13 +94,17 @@ def test_methods_may_have_classifiers_and_checkpoints_of_their_own(tmp_path: Pat
     rows = [
         row(method="dope"),
         row(method="feat", classifier="attention", shots=5, step=7, checkpoint_sha256="b", config_hash="d"),
-        row(method="rfs", classifier="logistic", shots=5, queries=10),  # fewer queries in one column by --fit
+        row(method="rfs", classifier="logistic", shots=5, queries=10, asked_queries=15),  # fewer by --fit
         row(method="vispe", classifier="centroid"),
     ]
     check_one_protocol([FoundRow(r, tmp_path) for r in (rows[0], rows[1], rows[3])])
     check_one_protocol([FoundRow(r, tmp_path) for r in (rows[0], rows[2])])
     with pytest.raises(UsageError, match="queries: 15 and 10"):
         check_one_protocol([FoundRow(r, tmp_path) for r in rows])
+    splits = [row(table="mine", table_split=i, queries=15 - i, asked_queries=15) for i in range(3)]
+    check_one_protocol([FoundRow(r, tmp_path) for r in splits])
+    with pytest.raises(UsageError, match="queries: 15 and 10"):
+        check_one_protocol([FoundRow(r, tmp_path) for r in (row(), row(shots=5, queries=10))])
 
 
 def test_splits_have_categories_of_their_own_and_so_another_hash(tmp_path: Path) -> None:
