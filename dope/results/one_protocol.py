@@ -12,14 +12,13 @@ from dope.lowshot.results import ResultRow
 from dope.results.sources import FoundRow
 
 SHARED = (
-    "table", "part", "split", "dataset", "classes", "shot_mode", "episodes", "seed",
+    "table", "part", "split", "dataset", "classes", "shot_mode", "episodes", "seed", "evaluation_hash",
 )  # fmt: skip
 """Columns that are equal in all rows of a table."""
-SHARED_IN_CELL = ("queries", "n_classes", "n_objects", "n_views", "evaluation_hash")
-"""Columns that are equal for one (ways, shots) of one table split: `--fit` may have reduced the queries of some, and
-the categories, which each split has its own of, are part of the hash."""
+SHARED_IN_CELL = ("queries", "n_classes", "n_objects", "n_views")
+"""Columns that are equal for one (ways, shots) of one table split: `--fit` may have reduced the queries of some."""
 MEANINGS = {
-    "evaluation_hash": "categories, image size or matching",
+    "evaluation_hash": "categories, image size, matching or support copies",
     "dataset": "fingerprint of the views",
     "split": "split of the shards",
 }
@@ -38,7 +37,6 @@ def check_one_protocol(found: Sequence[FoundRow]) -> None:
     as_asked = [item for item in found if item.row.queries == item.row.asked_queries]
     _check_groups(as_asked, ("queries",), lambda row: ())
     _check_groups(found, SHARED_IN_CELL, lambda row: (row.ways, row.shots, row.table_split))
-    _check_groups([item for item in found if not item.row.table], ("evaluation_hash",), lambda row: ())
 
 
 def check_no_duplicates(found: Sequence[FoundRow]) -> None:

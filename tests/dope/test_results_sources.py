@@ -107,15 +107,13 @@ def test_methods_may_have_classifiers_and_checkpoints_of_their_own(tmp_path: Pat
         check_one_protocol([FoundRow(r, tmp_path) for r in (row(), row(shots=5, queries=10))])
 
 
-def test_splits_have_categories_of_their_own_and_so_another_hash(tmp_path: Path) -> None:
+def test_splits_have_objects_of_their_own(tmp_path: Path) -> None:
     table = {"table": "co3d_ls", "part": "test"}
-    rows = [row(table_split=i, evaluation_hash=f"e{i}", n_objects=100 + i, **table) for i in range(5)]
+    rows = [row(table_split=i, n_objects=100 + i, **table) for i in range(5)]
     check_one_protocol([FoundRow(r, tmp_path) for r in rows])
-    other = row(table_split=3, evaluation_hash="e9", n_objects=103, method="rfs", **table)
-    with pytest.raises(UsageError, match=r"evaluation_hash .*: e3 and e9"):
+    other = row(table_split=3, n_objects=104, method="rfs", **table)
+    with pytest.raises(UsageError, match="n_objects: 103 and 104"):
         check_one_protocol([FoundRow(r, tmp_path) for r in (*rows, other)])
-    with pytest.raises(UsageError, match=r"evaluation_hash .*: e1 and e2"):
-        check_one_protocol([FoundRow(row(shots=i, evaluation_hash=f"e{i}"), tmp_path) for i in (1, 2)])
 
 
 def test_a_measurement_in_two_files_is_a_duplicate(tmp_path: Path) -> None:
