@@ -130,8 +130,9 @@ def _draw(axis: Axes, curve: Curve, number: int) -> Any:
 
 
 def _frame(axis: Axes) -> None:
-    from matplotlib.ticker import FuncFormatter
+    from matplotlib.ticker import FuncFormatter, MaxNLocator
 
+    axis.xaxis.set_major_locator(MaxNLocator(nbins=7, integer=True))
     axis.xaxis.set_major_formatter(FuncFormatter(lambda step, _: f"{step:,.0f}"))
     axis.spines[["top", "right"]].set_visible(False)
     axis.grid(axis="y", color="0.88", linewidth=0.8)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -132,6 +133,14 @@ def test_a_picture_is_drawn(tmp_path: Path, suffix: str) -> None:
         picture = cv2.imread(str(path))
         for colour in ((0xB2, 0x72, 0x00), (0x00, 0x5E, 0xD5), (0x73, 0x9E, 0x00)):  # BGR of the first three curves
             assert (np.abs(picture.astype(int) - colour).sum(-1) < 12).sum() > 50
+
+
+def test_ticks_are_whole_steps(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib", reason="the extra 'plot' is not installed")
+    path = plot_curves(training("a", 0.1, (1, 2, 3)), tmp_path / "p.svg")
+    # matplotlib names the texts that it draws as paths in comments
+    drawn = re.findall(r"<!-- ([\d,]+) -->", path.read_text())
+    assert [text for text in drawn if len(text) == 1] == ["1", "2", "3"]
 
 
 def test_missing_matplotlib_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
