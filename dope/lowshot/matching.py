@@ -12,6 +12,7 @@ the search ends as soon as the best match found exceeds that bound. The maximum 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -22,7 +23,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dope.common.seeds import derive_seed
-from dope.farthest_points import farthest_points
 from dope.lowshot.episodes import Episodes, Indices
 
 _LEVELS = (0.3, 0.05)  # norms at which the search for a better match may end: the object, its soft border, then all
@@ -68,11 +68,33 @@ def query_cells(norms: NDArray[np.float32], key: str, config: MatchingConfig) ->
     if len(foreground) < config.points:
         rng = np.random.default_rng(seed)
         return rng.choice(norms.size, config.points, replace=norms.size < config.points).astype(np.int64)
-    cells = torch.from_numpy(np.stack(np.unravel_index(foreground, norms.shape), axis=1)).float()
-    valid = torch.ones(1, len(cells), dtype=torch.bool)
-    start = torch.rand(1, generator=torch.Generator().manual_seed(seed))
-    chosen, _ = farthest_points(cells[None], valid, config.points, start)
-    return foreground[chosen[0].numpy()]
+    start = float(torch.rand(1, generator=torch.Generator().manual_seed(seed)))
+    return _farthest_cells(norms >= config.foreground, foreground[int(start * len(foreground))], config.points)
+
+
+def _farthest_cells(foreground: NDArray[np.bool_], first: int, n: int) -> NDArray[np.int64]:
+    """`n` cells of a foreground (h, w) that has as many, from `first` on each the farthest from those before.
+
+    Of equally far ones the first: as `dope.farthest_points`, but on a grid, where all distances from a cell are a part
+    of one table.
+    """
+    h, w = foreground.shape
+    table = _squared_distances(h, w)
+    nearest = np.where(foreground, np.int32(h * h + w * w), np.int32(-1))
+    chosen = np.empty(n, np.int64)
+    for i in range(n):
+        chosen[i] = first if i == 0 else int(nearest.argmax())
+        row, column = divmod(int(chosen[i]), w)
+        from_cell = table[h - 1 - row : 2 * h - 1 - row, w - 1 - column : 2 * w - 1 - column]
+        np.minimum(nearest, from_cell, out=nearest)
+    return chosen
+
+
+@functools.cache
+def _squared_distances(h: int, w: int) -> NDArray[np.int32]:
+    """(2h - 1, 2w - 1): squared distance of an offset, with no offset in the middle."""
+    rows, columns = np.arange(1 - h, h, dtype=np.int32), np.arange(1 - w, w, dtype=np.int32)
+    return rows[:, None] ** 2 + columns**2
 
 
 def best_similarities(queries: Tensor, query_norms: Tensor, support: SupportCells) -> Tensor:
