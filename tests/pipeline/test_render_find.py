@@ -11,6 +11,9 @@ from dope.common.errors import BadInput, UsageError
 from pipeline.inputs.sources import input_errors_as_rows
 from pipeline.render.find import RenderSource, find_meshes, mesh_fingerprint
 from pipeline.render.layouts import SYNSETS
+from pipeline.render.load import load_model
+from pipeline.render.mesh_files.obj import LARGEST_LIBRARY
+from pipeline.render.mesh_files.references import references
 
 SPLITS = Path(__file__).parents[2] / "dope/splits"
 
@@ -190,3 +193,19 @@ def test_the_fingerprint_is_of_all_that_is_read(tmp_path: Path) -> None:
     (tmp_path / "none.obj").unlink()
     with pytest.raises(BadInput, match=r"none\.obj"):
         mesh_fingerprint(source)
+
+
+def test_names_are_found_in_little_time_and_memory_whatever_a_file_holds(tmp_path: Path) -> None:
+    spaces = touch(tmp_path / "spaces.obj", f"mtllib a{' ' * 1_000_000}b.mtl\nmtllib  \nmtllib\tc d.mtl \r\nv 0 0 0\n")
+    assert [name for name, _ in references(spaces)] == ["a", "b.mtl", "c", "d.mtl"]
+    touch(tmp_path / "c d.mtl")
+    assert [name for name, _ in references(spaces)] == ["a", "b.mtl", "c d.mtl"]
+    large = touch(tmp_path / "large.obj", "mtllib large.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    with touch(tmp_path / "large.mtl").open("wb") as library:
+        library.truncate(LARGEST_LIBRARY + 1)
+    assert references(large) == [("large.mtl", tmp_path / "large.mtl")]
+    with pytest.raises(BadInput, match=r"large\.mtl: is huge for a library of materials"):
+        load_model(large, max_faces=9)
+    deep = '{"extras": %s, "buffers": [{"uri": "a%%20\\u00e4.bin"}, {"uri": "data:,x"}], "images": [{"uri" : "../b"}]}'
+    named = references(touch(tmp_path / "deep.gltf", deep % ("[" * 99_999 + "]" * 99_999)))
+    assert named == [("a ä.bin", tmp_path / "a ä.bin"), ("../b", None)]
