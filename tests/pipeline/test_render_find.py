@@ -161,6 +161,18 @@ def test_links_in_a_circle_end(tmp_path: Path) -> None:
     assert [s.path for s in found(tmp_path)] == [mesh]
 
 
+def test_links_to_nothing_and_pipes_are_rows(tmp_path: Path) -> None:
+    mesh = touch(tmp_path / "a/x.obj")
+    (tmp_path / "a/gone.obj").symlink_to("nowhere.obj")
+    (tmp_path / "a/loop.stl").symlink_to("loop.stl")
+    os.mkfifo(tmp_path / "a/pipe.ply")
+    sources, errors = find_meshes([tmp_path])
+    assert [s.path for s in sources] == [mesh]
+    reasons = {path.name: str(error) for _, path, error in errors}
+    assert sorted(reasons) == ["gone.obj", "loop.stl", "pipe.ply"]
+    assert "is a link to nothing" in reasons["gone.obj"] and "no regular file" in reasons["pipe.ply"]
+
+
 def test_the_fingerprint_is_of_all_that_is_read(tmp_path: Path) -> None:
     def of(name: str) -> dict[str, object]:
         value = mesh_fingerprint(found(tmp_path / name)[0])
