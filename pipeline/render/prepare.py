@@ -19,7 +19,7 @@ import numpy as np
 from dope.common import files
 from dope.common.errors import BadInput
 from pipeline import stages
-from pipeline.children import Notify, run_in_child
+from pipeline.children import Limits, Notify, run_in_child
 from pipeline.geometry import Camera
 from pipeline.masks.mask_io import write_masks
 from pipeline.prepare import RENDERS_A_PROCESS
@@ -103,11 +103,11 @@ def prepare_renders(
 
 def _require_renderer(config: RenderConfig, options: RunOptions) -> None:
     """Start the renderer once, in a process of its own: where it is missing, that is one error, not one an object."""
-    run_in_child(_start_renderer, config, limits=options.limits)
+    run_in_child(_start_renderer, config, options.limits, limits=options.limits)
 
 
-def _start_renderer(config: RenderConfig, notify: Notify) -> None:
-    _renderer(config).close()
+def _start_renderer(config: RenderConfig, limits: Limits, notify: Notify) -> None:
+    _renderer(config, limits).close()
 
 
 def _settled(config: RenderConfig) -> RenderConfig:
@@ -166,7 +166,7 @@ def _render_one(
     sequence, settled = Sequence(folder), _settled(config)
     marks = _marks(settled, inputs)
     work: list[tuple[str, Any, Any, Callable[[], dict[str, Any]]]] = [
-        ("frames", settled, inputs, lambda: render_frames(source, sequence, config)),
+        ("frames", settled, inputs, lambda: render_frames(source, sequence, config, options.limits)),
         ("sfm", None, marks["frames"], lambda: place_cameras(source, sequence, config)),
         ("depth", None, marks["sfm"], lambda: describe_depth(sequence)),
     ]
@@ -180,14 +180,14 @@ def _render_one(
     return rows
 
 
-def render_frames(source: ObjectSource, sequence: Sequence, config: RenderConfig) -> dict[str, Any]:
+def render_frames(source: ObjectSource, sequence: Sequence, config: RenderConfig, limits: Limits) -> dict[str, Any]:
     """The stage `frames`: the object loaded, posed, put in its scene and rendered; pairs that hardly show it dropped.
 
     Raises:
         BadInput: the mesh cannot be used, or no pair of views shows enough of it.
     """
     scene = build_scene(source, config)
-    renderer = _renderer(config)
+    renderer = _renderer(config, limits)
     pictures = list(renderer.render(scene))
     cameras = [shot.camera for shot in scene.shots]
     rows = _frames(pictures, cameras, config)
@@ -249,19 +249,19 @@ def build_scene(source: ObjectSource, config: RenderConfig) -> Scene:
 _renderers: dict[Any, Renderer] = {}
 
 
-def _renderer(config: RenderConfig) -> Renderer:
-    """This process's renderer: contexts and Blender are started once."""
+def _renderer(config: RenderConfig, limits: Limits) -> Renderer:
+    """This process's renderer: contexts and Blender are started once. Blender's process has the same limits as this."""
     its = config.fast if config.renderer == "fast" else config.cycles
-    if its not in _renderers:
+    if (its, limits) not in _renderers:
         if isinstance(its, FastConfig):
             from pipeline.render.fast import FastRenderer
 
-            _renderers[its] = FastRenderer(its)
+            _renderers[its, limits] = FastRenderer(its)
         else:
             from pipeline.render.cycles.renderer import CyclesRenderer
 
-            _renderers[its] = CyclesRenderer(its)
-    return _renderers[its]
+            _renderers[its, limits] = CyclesRenderer(its, limits)
+    return _renderers[its, limits]
 
 
 def _frames(pictures: list[Picture], cameras: list[Camera], config: RenderConfig) -> list[Frame]:
@@ -272,7 +272,7 @@ def _frames(pictures: list[Picture], cameras: list[Camera], config: RenderConfig
     ]
     for one, two in zip(rows[::2], rows[1::2], strict=True):
         least = min(float(pictures[row.frame].mask.mean()) for row in (one, two))
-        if least < config.mesh.min_mask_share:
+        if least < config.mesh.min_mask_share or not least:
             one.dropped = two.dropped = f"the object fills {least:.2%} of a view of this pair"
     return rows
 
