@@ -119,7 +119,8 @@ def mesh_fingerprint(source: RenderSource) -> dict[str, Any]:
                 read[legible(name)] = None
     except OSError as error:
         raise BadInput(f"cannot be read ({error.strerror})", where=error.filename or source.path) from error
-    return {"id": source.id, "category": source.category, "instance": source.instance, "up": source.up, "files": read}
+    value = {"id": source.id, "category": source.category, "instance": source.instance, "up": source.up, "files": read}
+    return value if source.subset is None else {**value, "subset": source.subset}
 
 
 def _content(path: Path) -> str | None:

@@ -72,6 +72,13 @@ def test_modelnet_gives_category_object_and_subset(tmp_path: Path) -> None:
     assert [(s.category, s.subset) for s in found(tmp_path / "ModelNet40")[2:]] == [("train", None)], "no such name"
 
 
+def test_a_mesh_that_went_to_the_other_subset_is_made_anew(tmp_path: Path) -> None:
+    train = touch(tmp_path / "chair/train/chair_0001.off")
+    before = mesh_fingerprint(found(train)[0])
+    (tmp_path / "chair/train").rename(tmp_path / "chair/test")
+    assert mesh_fingerprint(found(tmp_path / "chair/test/chair_0001.off")[0]) != before
+
+
 def test_shapenet_gives_the_synsets_name_in_both_versions(tmp_path: Path) -> None:
     for name in ("v1/02691156/ab1/model.obj", "v2/03001627/cd2/models/model_normalized.obj",
                  "v2/04379243/cd2/models/model_normalized.obj", "v2/04379243/cd2/images/t.jpg"):  # fmt: skip

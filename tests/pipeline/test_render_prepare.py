@@ -25,6 +25,7 @@ from pipeline.prepare import correspond_all
 from pipeline.render import prepare
 from pipeline.render.cameras import paired_cameras
 from pipeline.render.config import CyclesConfig, FastConfig, RenderConfig, ViewpointsConfig
+from pipeline.render.cycles import folders
 from pipeline.render.find import find_meshes
 from pipeline.render.prepare import ProceduralSource, prepare_renders
 from pipeline.render.scene import Picture, Scene
@@ -221,6 +222,15 @@ def test_blender_has_the_limits_that_were_asked_for(tmp_path: Path, monkeypatch:
     config = replace(CONFIG, renderer="cycles", cycles=CyclesConfig(samples=50))
     assert all(row.ok for row in prepare_renders([SOURCE], tmp_path, config, RunOptions(limits=limits)))
     assert set(began) == {(50, limits)}
+
+
+def test_nothing_is_left_in_memory_by_children_that_were_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(folders, "_MEMORY", tmp_path / "shm")
+    left = tmp_path / "shm/dope-cycles-left"
+    left.mkdir(parents=True)
+    (left / "lock").touch()
+    prepare_renders([SOURCE], tmp_path / "work", replace(CONFIG, renderer="cycles"), RunOptions())
+    assert not left.exists()
 
 
 @pytest.mark.parametrize("name", ["hdris", "materials"])
