@@ -11,6 +11,16 @@ from dope.common.errors import UsageError
 Recipe = Literal["modelnet", "shapenet", "abc", "plain", "procedural"]
 
 
+def _require_between(config: Any, **limits: tuple[float, float]) -> None:
+    """Refuse numbers, and pairs of them, that do not lie between their limits, or whose first is the greater."""
+    for name, (low, high) in limits.items():
+        value = getattr(config, name)
+        ends = value if isinstance(value, tuple) else (value, value)
+        if not low <= ends[0] <= ends[1] <= high:  # neither if one is no number
+            order = ", the lesser first" if isinstance(value, tuple) else ""
+            raise UsageError(f"{name} must be between {low:g} and {high:g}{order}, not {value}", where="settings")
+
+
 @dataclass(frozen=True)
 class ViewpointsConfig:
     """Where the cameras are: pairs of views (0, 1), (2, 3), ... as in the paper's renders (supplement)."""
@@ -33,10 +43,9 @@ class ViewpointsConfig:
     """The camera looks at a place up to this far from the object's middle, along each axis."""
 
     def __post_init__(self) -> None:
-        settings.require_at_least(self, pairs=1, size=16, second_azimuth_deg=0, jitter=0)
-        settings.require_at_least(self, lens_mm=1, sensor_mm=1)
-        _require_range(self, "zenith_deg", 0.1, 179.9)  # straight above nothing says which way is up
-        _require_range(self, "distance", 0.01, 1000)
+        settings.require_at_least(self, pairs=1, size=16)
+        _require_between(self, lens_mm=(1, 1000), sensor_mm=(1, 1000), second_azimuth_deg=(0, 180), jitter=(0, 10))
+        _require_between(self, zenith_deg=(0.1, 179.9), distance=(0.9, 100))  # half the diagonal of a cube: 0.87
 
 
 @dataclass(frozen=True)
@@ -59,8 +68,7 @@ class LookConfig:
     procedural ones."""
 
     def __post_init__(self) -> None:
-        settings.require_at_least(self, places=0)
-        _require_range(self, "strength", 0.01, 100)
+        _require_between(self, places=(0, 1000), strength=(0.01, 100))
 
 
 @dataclass(frozen=True)
@@ -105,8 +113,8 @@ class MeshConfig:
     """Pairs of which a view shows less of the object are dropped."""
 
     def __post_init__(self) -> None:
-        settings.require_at_least(self, max_faces=1, min_mask_share=0)
-        _require_at_most(self, min_mask_share=1)
+        settings.require_at_least(self, max_faces=1)
+        _require_between(self, min_mask_share=(0, 1))
 
 
 @dataclass(frozen=True)
@@ -133,18 +141,4 @@ class RenderConfig:
     """Of everything that is drawn, together with the object's id."""
 
     def __post_init__(self) -> None:
-        settings.require_at_least(self, jpeg_quality=1)
-        _require_at_most(self, jpeg_quality=100)
-
-
-def _require_at_most(config: Any, **most: float) -> None:
-    for name, value in most.items():
-        if getattr(config, name) > value:
-            raise UsageError(f"{name} must be at most {value:g}, not {getattr(config, name)}", where="settings")
-
-
-def _require_range(config: Any, name: str, least: float, most: float) -> None:
-    low, high = getattr(config, name)
-    if not least <= low <= high <= most:  # nor are numbers that are none
-        what = f"{name} must be two rising numbers between {least:g} and {most:g}, not {low:g} and {high:g}"
-        raise UsageError(what, where="settings")
+        _require_between(self, jpeg_quality=(1, 100))

@@ -26,6 +26,7 @@ from pipeline.prepare import RENDERS_A_PROCESS
 from pipeline.render.cameras import paired_cameras
 from pipeline.render.check import seen_by_both
 from pipeline.render.config import CyclesConfig, FastConfig, RenderConfig
+from pipeline.render.cycles import folders
 from pipeline.render.find import RenderSource, mesh_fingerprint
 from pipeline.render.scene import RENDERER_VERSIONS, Picture, Renderer, Scene
 from pipeline.sequence import Frame, Sequence, SequenceInfo, write_image
@@ -98,7 +99,11 @@ def prepare_renders(
         tasks.append(Task(folder, RENDER_STAGES, plan, _render_one, (source, inputs, config), refusal))
     if any(task.refusal is None and already_done(task, options) is None for task in tasks):
         _require_renderer(config, options)
-    return run_tasks(tasks, options, watcher or Unwatched(), reuse=RENDERS_A_PROCESS)
+    try:
+        return run_tasks(tasks, options, watcher or Unwatched(), reuse=RENDERS_A_PROCESS)
+    finally:
+        if config.renderer == "cycles":
+            folders.sweep()  # children are ended by a signal
 
 
 def _require_renderer(config: RenderConfig, options: RunOptions) -> None:
@@ -126,7 +131,7 @@ def _marks(config: RenderConfig, inputs: Any) -> dict[str, str]:
 def _fingerprint(source: ObjectSource) -> dict[str, Any]:
     if isinstance(source, ProceduralSource):
         return {"id": source.id, "number": source.number, "seed": source.seed}
-    return {"id": source.id, "category": source.category, "up": source.up, **mesh_fingerprint(source)}
+    return mesh_fingerprint(source)
 
 
 def _folders(config: RenderConfig) -> dict[str, Any]:
@@ -272,7 +277,7 @@ def _frames(pictures: list[Picture], cameras: list[Camera], config: RenderConfig
     ]
     for one, two in zip(rows[::2], rows[1::2], strict=True):
         least = min(float(pictures[row.frame].mask.mean()) for row in (one, two))
-        if least < config.mesh.min_mask_share:
+        if least < config.mesh.min_mask_share or not least:
             one.dropped = two.dropped = f"the object fills {least:.2%} of a view of this pair"
     return rows
 
