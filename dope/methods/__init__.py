@@ -15,6 +15,10 @@ if TYPE_CHECKING:
 
 METHODS: dict[str, str] = {
     "dope": "dope.methods.dope:Dope",
+    "supmoco": "dope.methods.supmoco:SupMoCo",
+    "vispe": "dope.methods.vispe:Vispe",
+    "vispe_moco": "dope.methods.vispe_moco:VispeMoCo",
+    "vispe_simsiam": "dope.methods.vispe_simsiam:VispeSimSiam",
 }
 """Name -> where its class is; imported when it is asked for."""
 
