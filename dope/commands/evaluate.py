@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from dope.commands.options import Device, Run, Shards, device_name
+from dope.common.errors import UsageError
+
+if TYPE_CHECKING:
+    from dope.lowshot.splits import SplitTable
 
 
 def evaluate(
@@ -26,37 +31,98 @@ def evaluate(
     shot_mode: Annotated[
         str, typer.Option(help="Shots of a category: several_instances, or one_instance seen from several sides.")
     ] = "several_instances",
+    table: Annotated[
+        str | None,
+        typer.Option(
+            help="The paper's splits: modelnet40_ls, shapenet55_ls or co3d_ls. Every split is evaluated on its own "
+            "classes, and the mean of accuracies and of intervals is shown; base classes are never tested.",
+            show_default=False,
+        ),
+    ] = None,
+    split_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--split-file",
+            help='Splits of your own: {"base": [names], "splits": [{"val": [names], "test": [names]}, ...]}',
+            show_default=False,
+        ),
+    ] = None,
+    table_split: Annotated[
+        list[int] | None,
+        typer.Option("--table-split", help="Only this split, counted from 0; repeatable.", show_default=False),
+    ] = None,
+    part: Annotated[str, typer.Option(help="Classes of each split: test or val.")] = "test",
+    select: Annotated[
+        bool,
+        typer.Option(
+            "--select",
+            help="Of all checkpoints of RUN, test on each split the one that is best on its validation classes "
+            "(5-way 1-shot; of equal ones the later).",
+        ),
+    ] = False,
     categories: Annotated[
         list[str] | None, typer.Option("--category", help="Only these; repeatable.", show_default=False)
     ] = None,
-    classifier: Annotated[str, typer.Option(help="local: local matching, as in the paper; centroid.")] = "local",
+    classifier: Annotated[
+        str,
+        typer.Option(
+            help="auto: the method's own. local: local matching of dense descriptors, as in the paper. Of pooled "
+            "features: centroid (nearest class mean), nearest (nearest shot), logistic (regression in each episode)."
+        ),
+    ] = "auto",
+    support_copies: Annotated[
+        int,
+        typer.Option(
+            "--support-copies",
+            min=1,
+            help="With logistic: learn from each shot so many times, all but the first augmented as in training.",
+        ),
+    ] = 1,
     split: Annotated[str, typer.Option(help="Views of the shards: all, train or val.")] = "all",
-    fit: Annotated[bool, typer.Option("--fit", help="Fewer ways or queries where the views do not suffice.")] = False,
+    fit: Annotated[
+        bool, typer.Option("--fit", help="Fewer ways, queries or classes where the views do not suffice.")
+    ] = False,
     compare_untrained: Annotated[
         bool, typer.Option("--compare-untrained", help="The same episodes with random weights, too.")
     ] = False,
     seed: Annotated[int, typer.Option(help="Seed of the episodes.")] = 0,
-    memory_gb: Annotated[float, typer.Option(help="Descriptors kept in memory; beyond it, encoded again.")] = 4.0,
+    memory: Annotated[float, typer.Option(help="GiB of descriptors kept in memory; the others wait on a disk.")] = 4.0,
+    memory_gb: Annotated[float | None, typer.Option("--memory-gb", hidden=True)] = None,  # its former name
+    cache: Annotated[
+        Path | None,
+        typer.Option(
+            "--cache",
+            help="Folder on that disk; nothing stays there.  [default: the temporary folder]",
+            show_default=False,
+        ),
+    ] = None,
     device: Device = "auto",
 ) -> None:
     """Low-shot recognition: accuracy over random episodes with its 95% confidence interval, beside chance.
 
-    A query is compared with every labelled view by local matching of its dense descriptors (paper, section 4).
+    DOPE compares a query with every labelled view by local matching of its dense descriptors (paper, section 4); other
+    methods have classifiers of pooled features, and any method can be put under any of these.
 
     Examples:
 
       dope eval run shards --ways 5 --ways 10 --shots 1 --shots 5
 
       dope eval run shards --classes instance --split val --ways 5 --queries 2
+
+    The paper's tables, a checkpoint chosen for every split:
+
+      dope eval run shards --table modelnet40_ls --select --ways 5 --ways 10 --shots 1 --shots 5
+
+      dope eval run shards --split-file my_splits.json --table-split 0 --classifier logistic --support-copies 5
     """
     from rich.console import Console
+    from rich.markup import escape
 
-    from dope.checkpoints import find_checkpoint
     from dope.common import settings
     from dope.common.progress import progress_bar
+    from dope.heap import keep_heap
     from dope.lowshot.episodes import EpisodeConfig
     from dope.lowshot.evaluate import EvaluationConfig
-    from dope.lowshot.evaluate import evaluate as run_evaluation
     from dope.lowshot.results import append_rows, results_table
 
     episode: dict[str, Any] = {
@@ -68,19 +134,51 @@ def evaluate(
         for way in ways or [5]
         for shot in shots or [1]
     )
-    values: dict[str, Any] = {"classifier": classifier, "split": split, "compare_untrained": compare_untrained}
-    values |= {"categories": tuple(categories or ()), "memory_gb": memory_gb}
-    config = settings.from_mapping(EvaluationConfig, {**values, "protocols": protocols}, where="dope eval")
-    checkpoint = find_checkpoint(run)
+    values: dict[str, Any] = {
+        "classifier": classifier, "split": split, "compare_untrained": compare_untrained, "part": part,
+        "support_copies": support_copies, "memory_gib": memory if memory_gb is None else memory_gb,
+        "categories": tuple(categories or ()),
+        "table_splits": tuple(table_split or ()), "protocols": protocols,
+    }  # fmt: skip
+    config = settings.from_mapping(EvaluationConfig, values, where="dope eval")
+    config = replace(config, cache=cache)
+    splits = _splits(table, split_file, select)
+    keep_heap()
     with progress_bar() as progress:
-        result = run_evaluation(checkpoint, shards, config, device=device_name(device), progress=progress)
+        options: dict[str, Any] = {"device": device_name(device), "progress": progress}
+        if select:
+            from dope.lowshot.selection import evaluate_best
+
+            assert splits is not None
+            result = evaluate_best(run, shards, config, splits, **options)
+        else:
+            from dope.checkpoints import find_checkpoint
+            from dope.lowshot.evaluate import evaluate as run_evaluation
+
+            result = run_evaluation(find_checkpoint(run), shards, config, table=splits, **options)
     folder = out or (run if run.is_dir() else run.parent.parent) / "eval"
     append_rows(folder / "results.parquet", result.rows)
     append_rows(folder / "results.json", result.rows)
     console = Console(highlight=False)
-    console.print(results_table(result.rows))
+    console.print(results_table([row for row in result.rows if not select or row.part == "test"]))
+    for note in result.notes:
+        console.print(escape(note), soft_wrap=True)
     console.print(
         f"{result.encode_ms_per_view:.0f} ms a view to encode, {result.match_ms_per_episode:.1f} ms an episode to "
-        f"match; rows in [bold]{folder / 'results.parquet'}[/]",
+        f"match; rows in [bold]{escape(str(folder / 'results.parquet'))}[/]",
         soft_wrap=True,
     )
+
+
+def _splits(table: str | None, split_file: Path | None, select: bool) -> SplitTable | None:
+    """The table that --table or --split-file names."""
+    from dope.lowshot.splits import paper_table, read_split_file
+
+    if table is not None and split_file is not None:
+        raise UsageError("names splits, and --table does too", where="--split-file", remedy="Leave one of them out")
+    if table is None and split_file is None:
+        if select:
+            remedy = "Add --table modelnet40_ls, shapenet55_ls or co3d_ls, or --split-file FILE"
+            raise UsageError("needs splits with validation classes", where="--select", remedy=remedy)
+        return None
+    return paper_table(table) if table is not None else read_split_file(split_file) if split_file else None

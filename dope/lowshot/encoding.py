@@ -7,8 +7,8 @@ others are projected when a search really comes to them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Protocol
+from collections.abc import Callable
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -16,8 +16,6 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dope.common.progress import Progress
-from dope.lowshot.views import ViewShards
 from dope.networks import NetworkOutput
 from dope.networks.dope import CELLS_AT_ONCE
 
@@ -62,10 +60,35 @@ class ViewCells:
     def dim(self) -> int:
         return self._descriptors.shape[1]
 
+    @classmethod
+    def of_grid(cls, descriptors: Tensor) -> ViewCells:
+        """From the descriptors (h, w, D) of all cells, of any norm: what an encoder without a projector has."""
+        height, width, dim = descriptors.shape
+        flat = descriptors.reshape(height * width, dim).float()
+        norms, order = flat.norm(dim=1).sort(descending=True, stable=True)
+        return cls((height, width), order.cpu().numpy(), norms.cpu().numpy(), flat[order], flat[:0], _as_they_are)
+
     @property
-    def largest_nbytes(self) -> int:
-        """Memory once all cells are projected."""
-        return len(self) * (self._descriptors.element_size() * self.dim + self.cells.itemsize + self.norms.itemsize)
+    def nbytes(self) -> int:
+        """Memory that it takes as it is: descriptors of some cells, features of the others."""
+        tensors = self._descriptors.nbytes + self._rest.nbytes
+        return tensors + self.cells.nbytes + self.norms.nbytes
+
+    def packed(self) -> tuple[Callable[..., ViewCells], list[NDArray[Any]]]:
+        """All numbers as arrays of 4 bytes each, and what makes the same view of them again, on the same device."""
+        device, grid, describe = self._descriptors.device, self.grid, self._describe
+
+        def rebuild(cells: NDArray[Any], norms: NDArray[Any], *parts: NDArray[Any]) -> ViewCells:
+            descriptors, rest = (torch.from_numpy(part).to(device) for part in parts)
+            return ViewCells(grid, cells.astype(np.int64), norms, descriptors, rest, describe)
+
+        parts = (part.float().cpu().numpy() for part in (self._descriptors, self._rest))
+        return rebuild, [self.cells.astype(np.int32), self.norms, *parts]
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether no number that is computed yet is NaN or infinite."""
+        return bool(np.isfinite(self.norms).all() and self._descriptors.isfinite().all())
 
     @property
     def norm_map(self) -> NDArray[np.float32]:
@@ -97,29 +120,6 @@ class ViewCells:
         return found
 
 
-def encode_views(
-    network: Encoder,
-    views: ViewShards,
-    indices: NDArray[np.integer],
-    *,
-    device: torch.device | str = "cpu",
-    batch: int = 16,
-    image_size: int | None = None,
-    progress: Progress | None = None,
-) -> Iterator[tuple[int, ViewCells]]:
-    """Encode views once each, in order: (index, cells). The network must be in eval mode.
-
-    `image_size` is the side in pixels that it was trained with; views of another size are resized.
-    """
-    done = 0
-    for images in views.batches(indices, batch, image_size=image_size):
-        for cells in encode(network, to_tensor(images, device)):
-            yield int(indices[done]), cells
-            done += 1
-        if progress is not None:
-            progress("encode", done, len(indices))
-
-
 def to_tensor(images: NDArray[np.uint8], device: torch.device | str = "cpu") -> Tensor:
     """uint8 images (B, H, W, 3) as float (B, 3, H, W) in [0, 1]."""
     return torch.from_numpy(images).to(device).permute(0, 3, 1, 2).float() / 255
@@ -128,7 +128,8 @@ def to_tensor(images: NDArray[np.uint8], device: torch.device | str = "cpu") -> 
 @torch.inference_mode()
 def encode(network: Encoder, images: Tensor) -> list[ViewCells]:
     """Encode float images (B, 3, H, W) in [0, 1]; the object's cells are projected in one go."""
-    features, mask_logits = network(images)
+    # convolutions of a CPU are faster on it, and a cell's channels lie side by side for the projector
+    features, mask_logits = network(images.contiguous(memory_format=torch.channels_last))
     height, width = features.shape[-2:]
     norms, order = mask_logits.float().sigmoid().flatten(1).sort(dim=1, descending=True, stable=True)
     features = features.permute(0, 2, 3, 1).flatten(1, 2)
@@ -151,6 +152,10 @@ def encode(network: Encoder, images: Tensor) -> list[ViewCells]:
         )
         for i, count in enumerate(counts)
     ]
+
+
+def _as_they_are(features: Tensor, norms: NDArray[np.float32]) -> Tensor:
+    return features
 
 
 class _Describe:

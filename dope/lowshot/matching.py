@@ -4,14 +4,15 @@ Paper section 4 ("low-shot recognition"): k = 20 of the query's foreground cells
 their best match among all cells of the support view; the sum of the k similarities is the score of the support view;
 the query takes the class of the best one.
 
-Each (query view, support view) pair is scored once for a whole evaluation. Descriptors are unit vectors times the
+Each (query view, support view) pair is scored once for a whole evaluation, and no table of pairs is kept: support views
+come one at a time, and every query remembers its best shot so far. Descriptors are unit vectors times the
 soft mask, so a cell cannot match better than the product of the two norms: with the support's cells sorted by norm,
 the search ends as soon as the best match found exceeds that bound. The maximum over all cells is the same.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -26,6 +27,7 @@ from dope.lowshot.episodes import Episodes, Indices
 
 _LEVELS = (0.3, 0.05)  # norms at which the search for a better match may end: the object, its soft border, then all
 _ROUNDING = 1e-5  # a bound must be exceeded by this share, more than float32 dot products of unit vectors err
+_QUERIES = 512  # query views whose descriptors are gathered at once: 10 MiB of 256 floats
 _SIMILARITIES = 1 << 19  # computed at once on a CPU: 2 MiB, so that the maximum is taken within the cache
 
 
@@ -110,74 +112,81 @@ def _row_maxima(queries: Tensor, cells: Tensor) -> Tensor:
     return best
 
 
-class PairScores:
-    """The scores of all (query view, support view) pairs that some episodes need, each computed once."""
-
-    def __init__(self, episodes: Iterable[Episodes], n_views: int) -> None:
-        self._n_views = n_views
-        needed = [np.unique(_pair_codes(part, n_views)) for batch in episodes for part in _parts(batch)]
-        self._codes = np.unique(np.concatenate(needed))  # sorted by support view, then query view
-        self._scores = np.full(len(self._codes), np.nan, np.float32)
-
-    def __len__(self) -> int:
-        return len(self._codes)
-
-    @property
-    def support_views(self) -> Indices:
-        return np.unique(self._codes // self._n_views)
-
-    def queries_of(self, support_view: int) -> Indices:
-        """The query views that are to be scored against a support view, sorted."""
-        return self._codes[self._range(support_view)] % self._n_views
-
-    def set(self, support_view: int, scores: NDArray[np.float32]) -> None:
-        """Scores in the order of `queries_of`."""
-        self._scores[self._range(support_view)] = scores
-
-    def of(self, episodes: Episodes) -> NDArray[np.float32]:
-        """Scores (E, ways * queries, ways * shots)."""
-        codes = _pair_codes(episodes, self._n_views)
-        return self._scores[np.searchsorted(self._codes, codes)]
-
-    def _range(self, support_view: int) -> slice:
-        low, high = np.searchsorted(self._codes, [support_view * self._n_views, (support_view + 1) * self._n_views])
-        return slice(int(low), int(high))
-
-
-def score_support(queries: Tensor, query_norms: Tensor, support: SupportCells) -> NDArray[np.float32]:
+def score_support(
+    queries: Tensor, query_norms: Tensor, support: SupportCells, rows: NDArray[np.integer] | None = None
+) -> NDArray[np.float32]:
     """Scores (Q,) of Q query views against one support view.
 
     Args:
-        queries: (Q, k, D) descriptors of the query views' cells.
-        query_norms: (Q, k).
+        queries: (N, k, D) descriptors of the query views' cells, on the support's device or on the CPU.
+        query_norms: (N, k).
         support: the support view.
+        rows: (Q,) which of the N query views; None: all.
     """
-    n, k, dim = queries.shape
-    best = best_similarities(queries.reshape(n * k, dim), query_norms.reshape(n * k), support)
-    return best.view(n, k).sum(1).cpu().numpy()
+    chosen = np.arange(len(queries)) if rows is None else rows
+    scores = np.empty(len(chosen), np.float32)
+    device = support.descriptors(0, 1).device
+    for start in range(0, len(chosen), _QUERIES):
+        part = torch.from_numpy(chosen[start : start + _QUERIES]).to(queries.device)
+        descriptors, norms = queries[part].to(device), query_norms[part].to(device)
+        best = best_similarities(descriptors.flatten(0, 1), norms.flatten(), support)
+        scores[start : start + _QUERIES] = best.view(len(part), -1).sum(1).cpu().numpy()
+    return scores
 
 
-def nearest_shot(episodes: Episodes, scores: PairScores) -> NDArray[np.int64]:
-    """The way (E, ways, queries) of the best support view of each query; of equal ones, the first."""
-    predicted = np.empty(episodes.query.shape, np.int64)
-    start = 0
-    for part in _parts(episodes):
-        best = scores.of(part).argmax(2) // part.config.shots
-        predicted[start : start + len(part)] = best.reshape(part.query.shape)
-        start += len(part)
-    return predicted
+class BestShots:
+    """The best support view of every query of some episodes, among those that were scored so far.
 
+    Its size is that of the episodes: as many numbers as they have queries and shots.
 
-def _pair_codes(episodes: Episodes, n_views: int) -> Indices:
-    """support view * n_views + query view: (E, ways * queries, ways * shots)."""
-    e = len(episodes)
-    return episodes.support.reshape(e, 1, -1) * n_views + episodes.query.reshape(e, -1, 1)
+    Args:
+        episodes: of any number of protocols over the same views.
+    """
 
-
-def _parts(episodes: Episodes, n: int = 256) -> Iterator[Episodes]:
-    """The episodes in chunks, so that tables of pairs stay small."""
-    for start in range(0, len(episodes), n):
-        part = slice(start, start + n)
-        yield Episodes(
-            episodes.support[part], episodes.query[part], episodes.classes[part], episodes.names, episodes.config
+    def __init__(self, episodes: Sequence[Episodes]) -> None:
+        self._episodes = episodes
+        self._queries = [drawn.query.reshape(len(drawn), -1) for drawn in episodes]  # (E, ways * queries)
+        self._scores = [np.full(queries.shape, -np.inf, np.float32) for queries in self._queries]
+        self._places = [np.full(queries.shape, np.iinfo(np.int32).max, np.int32) for queries in self._queries]
+        # where each support view occurs: protocol, episode and place among the shots, sorted by view
+        views = np.concatenate([drawn.support.ravel() for drawn in episodes])
+        order = np.argsort(views, kind="stable")
+        sizes = [drawn.support[0].size for drawn in episodes]
+        slots = [
+            (np.full(len(drawn) * n, t), np.repeat(np.arange(len(drawn)), n), np.tile(np.arange(n), len(drawn)))
+            for t, (drawn, n) in enumerate(zip(episodes, sizes, strict=True))
+        ]
+        self._protocol, self._episode, self._place = (
+            np.concatenate(column).astype(np.int32)[order] for column in zip(*slots, strict=True)
         )
+        self.support_views, starts = np.unique(views[order], return_index=True)
+        self._ends = np.append(starts, len(order))
+
+    def queries_of(self, support_view: int) -> Indices:
+        """The query views, sorted, that are to be scored against a support view."""
+        needed = [self._queries[t][episodes].ravel() for t, episodes, _ in self._slots(support_view)]
+        return np.unique(np.concatenate(needed))
+
+    def add(self, support_view: int, queries: Indices, scores: NDArray[np.float32]) -> None:
+        """Take in the scores (Q,) of `queries_of` a support view; of equal scores the first shot of an episode wins."""
+        for t, episodes, places in self._slots(support_view):
+            new = scores[np.searchsorted(queries, self._queries[t][episodes])]
+            place = places[:, None]
+            old, old_place = self._scores[t][episodes], self._places[t][episodes]
+            better = (new > old) | ((new == old) & (place < old_place))
+            self._scores[t][episodes] = np.where(better, new, old)
+            self._places[t][episodes] = np.where(better, place, old_place)
+
+    def predictions(self) -> list[Indices]:
+        """The way (E, ways, queries) of every query's best shot, for each protocol; 1-NN over all shots."""
+        return [
+            (places // drawn.config.shots).astype(np.int64).reshape(drawn.query.shape)
+            for drawn, places in zip(self._episodes, self._places, strict=True)
+        ]
+
+    def _slots(self, support_view: int) -> list[tuple[int, Indices, Indices]]:
+        """(protocol, episodes, places) in which a view is a shot; an episode holds it once."""
+        i = int(np.searchsorted(self.support_views, support_view))
+        part = slice(int(self._ends[i]), int(self._ends[i + 1]))
+        protocols, episodes, places = self._protocol[part], self._episode[part], self._place[part]
+        return [(int(t), episodes[protocols == t], places[protocols == t]) for t in np.unique(protocols)]

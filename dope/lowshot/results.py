@@ -28,7 +28,8 @@ class ResultRow:
     network: str
     """"trained", or "untrained" for the same network with random weights."""
     classifier: str
-    """local (1-NN by local matching) or centroid (nearest mean of pooled descriptors)."""
+    """local (1-NN by local matching); of pooled features centroid (nearest class mean), nearest (1-NN) or logistic
+    (regression); or the method's own: cl2n, attention."""
     classes: str
     """category or instance."""
     ways: int
@@ -73,6 +74,16 @@ class ResultRow:
     """Of the training run (trained) or of the network's settings (untrained)."""
     evaluation_hash: str
     """Of the evaluation's settings other than those above."""
+    method: str = "dope"
+    """What made the features: a method of `dope train`, or an encoder's label."""
+    run: str = ""
+    """Name of the run's folder, which tells runs of one method apart; empty where there is no run."""
+    table: str = ""
+    """Table of splits (modelnet40_ls, shapenet55_ls, co3d_ls, or the name of a --split-file); empty without one."""
+    table_split: int = -1
+    """Which of its splits, from 0; -1 without a table."""
+    part: str = "all"
+    """Classes of that split: test or val; all without a table."""
 
     @property
     def protocol(self) -> str:
@@ -112,23 +123,58 @@ def read_rows(path: Path) -> list[ResultRow]:
         raise BadInput(f"does not hold result rows ({error})", where=path, remedy="`dope eval` writes it") from error
 
 
+def mean_over_splits(rows: Iterable[ResultRow]) -> list[tuple[ResultRow, int]]:
+    """Rows that differ in the split of one table alone, as one each: mean accuracy and mean CI, as the paper has it.
+
+    Returns:
+        rows with `table_split` -1 where several became one, and how many they were; numbers of classes, objects and
+        views are the smallest of them, checkpoint and step None where they differ.
+    """
+    groups: dict[tuple[Any, ...], list[ResultRow]] = {}
+    for row in rows:
+        key = tuple(value for name, value in dataclasses.asdict(row).items() if name not in _PER_SPLIT)
+        groups.setdefault(key, []).append(row)
+    return [(_mean(group), len(group)) for group in groups.values()]
+
+
+_PER_SPLIT = (
+    *OUTCOME, "table_split", "n_classes", "n_objects", "n_views", "checkpoint", "checkpoint_sha256", "step",
+)  # fmt: skip
+
+
+def _mean(rows: Sequence[ResultRow]) -> ResultRow:
+    if len(rows) == 1:
+        return rows[0]
+    means = {name: sum(getattr(row, name) for row in rows) / len(rows) for name in OUTCOME}
+    least = {name: min(getattr(row, name) for row in rows) for name in ("n_classes", "n_objects", "n_views")}
+    weights = ("checkpoint", "checkpoint_sha256", "step")
+    differing: dict[str, Any] = {name: None for name in weights if len({getattr(row, name) for row in rows}) > 1}
+    return dataclasses.replace(rows[0], table_split=-1, **means, **least, **differing)
+
+
 def results_table(rows: Sequence[ResultRow], title: str = "Low-shot recognition") -> Table:
     """The rows as a table for the terminal: accuracy in % with its 95% confidence interval, beside chance.
 
-    What all rows have in common is said once, below the table.
+    Splits of a table are shown as their mean. What all rows have in common is said once, below the table.
     """
     from rich.table import Table
 
+    counted = mean_over_splits(rows)
+    rows, counts = [row for row, _ in counted], [count for _, count in counted]
     table = Table(title=title, caption_justify="left")
     details = {
-        "of": [f"{row.n_classes} {'categories' if row.classes == 'category' else 'objects'}" for row in rows],
+        "table": [_table(row, count) for row, count in counted],
+        "of": [_classes(row, count) for row, count in counted],
         "views": [f"{row.n_views} views ({row.split})" for row in rows],
+        "method": [row.method if row.network == "trained" else "" for row in rows],
         "classifier": [{"local": "local matching"}.get(row.classifier, row.classifier) for row in rows],
         "queries": [f"{row.queries} queries a class" for row in rows],
         "episodes": [f"{row.episodes:,} episodes" for row in rows],
     }
-    common = [values[0] for values in details.values() if len(set(values)) == 1]
-    table.caption = ", ".join(common)
+    if max(counts, default=1) > 1:
+        del details["views"]
+    shared = [values[0] for values in details.values() if len(set(values)) == 1]
+    table.caption = ", ".join(value for value in shared if value)
     varying = {name: values for name, values in details.items() if len(set(values)) > 1}
     for name in ("protocol", "network", *varying):
         table.add_column(name)
@@ -140,6 +186,18 @@ def results_table(rows: Sequence[ResultRow], title: str = "Low-shot recognition"
         cells = [values[i] for values in varying.values()]
         table.add_row(_protocol(row), trained, *cells, accuracy, f"{100 * row.chance:.1f}")
     return table
+
+
+def _table(row: ResultRow, splits: int) -> str:
+    if not row.table:
+        return ""
+    which = f"mean of {splits} splits" if splits > 1 else f"split {row.table_split}"
+    return f"{row.table} ({which}, {row.part})"
+
+
+def _classes(row: ResultRow, splits: int) -> str:
+    least = "at least " if splits > 1 else ""
+    return f"{least}{row.n_classes} {'categories' if row.classes == 'category' else 'objects'}"
 
 
 def _protocol(row: ResultRow) -> str:

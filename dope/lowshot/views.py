@@ -68,6 +68,16 @@ class ViewShards:
         """The image alone, (H, W, 3) uint8 RGB."""
         return np.ascontiguousarray(self._decode(index, self._members(index), "jpg", cv2.IMREAD_COLOR)[..., ::-1])
 
+    def mask(self, index: int) -> NDArray[np.bool_]:
+        """The mask alone, (H, W) bool."""
+        return self._decode(index, self._members(index), "png", cv2.IMREAD_GRAYSCALE) > 127
+
+    def masks(
+        self, indices: Sequence[int] | NDArray[np.integer], *, image_size: int | None = None
+    ) -> NDArray[np.bool_]:
+        """Masks of `indices` (B, H, W); with `image_size` resized as the images are."""
+        return np.stack([resized(255 * self.mask(int(i)).astype(np.uint8), image_size) > 127 for i in indices])
+
     def batches(
         self, indices: Sequence[int] | NDArray[np.integer], size: int, *, image_size: int | None = None
     ) -> Iterator[NDArray[np.uint8]]:

@@ -11,10 +11,9 @@ from torch import Tensor
 from dope.lowshot.encoding import ViewCells, encode
 from dope.lowshot.episodes import EpisodeConfig, Episodes, sample_episodes
 from dope.lowshot.matching import (
+    BestShots,
     MatchingConfig,
-    PairScores,
     best_similarities,
-    nearest_shot,
     query_cells,
     score_support,
 )
@@ -128,12 +127,12 @@ def test_predictions_equal_a_naive_implementation() -> None:
     episodes, views = drawn_and_views()
     cells = {i: query_cells(as_cells(view).norm_map, str(i), CONFIG) for i, view in enumerate(views)}
 
-    pairs = PairScores([episodes], len(views))
-    for s in pairs.support_views.tolist():
-        queries = pairs.queries_of(s).tolist()
-        descriptors = torch.stack([as_cells(views[q]).at(cells[q]) for q in queries])
-        pairs.set(s, score_support(descriptors, descriptors.norm(dim=2), as_cells(views[s])))
-    predicted = nearest_shot(episodes, pairs)
+    best = BestShots([episodes])
+    for s in best.support_views.tolist():
+        queries = best.queries_of(s)
+        descriptors = torch.stack([as_cells(views[q]).at(cells[q]) for q in queries.tolist()])
+        best.add(s, queries, score_support(descriptors, descriptors.norm(dim=2), as_cells(views[s])))
+    (predicted,) = best.predictions()
 
     for e in range(len(episodes)):
         for way in range(3):
@@ -146,19 +145,27 @@ def test_predictions_equal_a_naive_implementation() -> None:
                 assert predicted[e, way, i] == max(scores, key=lambda place: scores[place])[0]
 
 
-def test_each_pair_is_needed_once_and_all_are_scored() -> None:
-    episodes, views = drawn_and_views()
-    pairs = PairScores([episodes, episodes], len(views))
+def test_each_pair_is_asked_for_once_and_in_any_order_the_first_of_the_best_wins() -> None:
+    episodes, _ = drawn_and_views()
     needed = {
         (int(s), int(q)) for e in range(12) for s in episodes.support[e].ravel() for q in episodes.query[e].ravel()
     }
-    assert len(pairs) == len(needed)
-    for s in pairs.support_views.tolist():
-        assert pairs.queries_of(s).tolist() == sorted(q for support, q in needed if support == s)
-        pairs.set(s, np.array([1000 * s + q for q in pairs.queries_of(s)], np.float32))
-    scores = pairs.of(episodes)
-    expected = 1000 * episodes.support.reshape(12, 1, -1) + episodes.query.reshape(12, -1, 1)
-    np.testing.assert_array_equal(scores, expected)
+    score = {pair: (7 * pair[0] + 3 * pair[1]) % 4 for pair in needed}  # many are equal
+    expected = np.empty(episodes.query.shape, np.int64)
+    for e, way, i in np.ndindex(*expected.shape):
+        scores = [[score[int(s), int(episodes.query[e, way, i])] for s in shots] for shots in episodes.support[e]]
+        expected[e, way, i] = int(np.argmax(scores)) // 2
+    for order in (1, -1):
+        best = BestShots([episodes, episodes])
+        asked: list[tuple[int, int]] = []
+        for s in best.support_views[::order].tolist():
+            queries = best.queries_of(s)
+            assert (np.diff(queries) > 0).all()
+            asked += [(s, int(q)) for q in queries]
+            best.add(s, queries, np.array([score[s, int(q)] for q in queries], np.float32))
+        assert len(asked) == len(needed) and set(asked) == needed
+        for predicted in best.predictions():
+            np.testing.assert_array_equal(predicted, expected)
 
 
 def test_encoded_cells_are_the_networks_descriptors() -> None:
