@@ -6,8 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from dope.lowshot.embedding import Embedder
-from dope.networks import ResNet18
 from dope.networks.init import init_encoder
+from dope.networks.resnet import ResNet18
 
 
 class PooledNetwork(nn.Module):
