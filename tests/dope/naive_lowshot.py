@@ -39,9 +39,7 @@ def query_cells(grid: Tensor, key: str, config: MatchingConfig) -> list[tuple[in
     return chosen
 
 
-def classify(
-    network: DopeNetwork, views: ViewShards, episodes: Episodes, config: MatchingConfig
-) -> NDArray[np.int64]:
+def classify(network: DopeNetwork, views: ViewShards, episodes: Episodes, config: MatchingConfig) -> NDArray[np.int64]:
     """The predicted way (E, ways, queries) of every query."""
     predicted = np.empty(episodes.query.shape, np.int64)
     for e in range(len(episodes)):
@@ -50,8 +48,6 @@ def classify(
             index = int(episodes.query[e, way, i])
             grid = descriptors(network, views, index)
             cells = query_cells(grid, views.columns["key"][index], config)
-            scores = [
-                [sum(float((shot @ grid[r, c]).max()) for r, c in cells) for shot in of_way] for of_way in shots
-            ]
+            scores = [[sum(float((shot @ grid[r, c]).max()) for r, c in cells) for shot in of_way] for of_way in shots]
             predicted[e, way, i] = int(np.argmax(np.max(scores, axis=1)))
     return predicted
