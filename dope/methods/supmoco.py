@@ -127,8 +127,8 @@ def supmoco_losses(
     queue_labels: Tensor,
     temperature: float,
 ) -> tuple[Tensor, Tensor]:
-    """-log(exp(l+) / (exp(l+) + sum over the queue of exp(q.m_j / T))), where l+ is the mean of q.k / T over the keys of
-    the query's class, its own P and those in the queue.
+    """-log(exp(l+) / (exp(l+) + sum over the queue of exp(q.m_j / T))), where l+ is the mean of q.k / T over the keys
+    of the query's class, its own P and those in the queue.
 
     Keys of the query's class in the queue are in the sum as well. A key without a class is nobody's positive; so is one
     of another class, which only stands in for a damaged view.

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from dope.batch import PairBatch
@@ -86,7 +87,8 @@ class VispeSimSiam(PairMethod):
         with autocast(self.config.precision, batch.objects.device):
             z1, p1, z2, p2 = online(batch.images1, batch.images2)
         loss = (negative_cosine(p1, z2) + negative_cosine(p2, z1)) / 2
-        return MeanLoss.of(loss, ranks, stop, spread=(spread(z1) + spread(z2)) / 2)
+        spreads = [spread(ranks.gather(z.detach())) for z in (z1, z2)]
+        return MeanLoss.of(loss, ranks, stop, spread=torch.stack(spreads).mean())
 
 
 def negative_cosine(predictions: Tensor, projections: Tensor) -> Tensor:
@@ -97,7 +99,7 @@ def negative_cosine(predictions: Tensor, projections: Tensor) -> Tensor:
 def spread(projections: Tensor) -> Tensor:
     """How far unit projections (B, D) differ: the mean over dimensions of their deviation over the batch, times the
     root of D; 1 where they are spread evenly, 0 where all are one, the collapse to look out for (section 4.1)."""
-    vectors = unit(projections.detach())
+    vectors = unit(projections)
     return vectors.std(0, correction=0).mean() * vectors.shape[1] ** 0.5
 
 
