@@ -32,6 +32,7 @@ def check(config: TrainConfig) -> None:
         *_rules(config),
         *_augmentation_rules(config.augmentation),
         *_contrast_rules(config),
+        *_feat_rules(config),
     ):
         if not ok:
             raise UsageError(f"'{values[key]}' {rule}", where=key, remedy=f"Change it with --set {key}=...")
@@ -60,7 +61,12 @@ def _rules(config: TrainConfig) -> tuple[Rule, ...]:
     alone = loss.negatives == "second_view" and data.points < 2
     return (
         ("data.image_size", data.image_size >= 32 and data.image_size % 32 == 0, "must be a positive multiple of 32"),
-        ("data.batch_size", data.batch_size >= 2, "must be at least 2: the other pairs of a batch are the negatives"),
+        ("data.batch_size", data.batch_size >= 1, "must be at least 1"),
+        (
+            "data.batch_size",
+            config.method == "feat" or data.batch_size >= 2,
+            "must be at least 2: the other pairs of a batch are the negatives",
+        ),
         ("data.micro_batch", data.micro_batch >= 0, "must not be negative"),
         ("data.pairs_per_object", data.pairs_per_object >= 1, "must be at least 1"),
         ("data.points", data.points >= 1, "must be at least 1"),
@@ -144,3 +150,15 @@ def _contrast_rules(config: TrainConfig) -> Iterator[Rule]:
     yield "vispe.alpha", vispe.alpha >= 0, "must not be negative"
     for name in ("projector", "predictor"):
         yield f"simsiam.{name}", getattr(simsiam, name) >= 1, "must be at least 1"
+
+
+def _feat_rules(config: TrainConfig) -> Iterator[Rule]:
+    feat = config.feat
+    for name, least in (("ways", 2), ("shots", 1), ("queries", 1), ("episodes", 1)):
+        yield f"feat.{name}", getattr(feat, name) >= least, f"must be at least {least}"
+    for name in ("temperature", "centre_temperature"):
+        yield f"feat.{name}", getattr(feat, name) > 0, "must be positive"
+    for name in ("balance", "encoder_lr_scale"):
+        yield f"feat.{name}", getattr(feat, name) >= 0, "must not be negative"
+    for name in ("attention_dropout", "output_dropout"):
+        yield f"feat.{name}", 0 <= getattr(feat, name) < 1, "must lie in [0, 1)"
