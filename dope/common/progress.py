@@ -21,7 +21,7 @@ def progress_bar() -> Iterator[Progress]:
 
     console = Console(stderr=True, highlight=False)
     if not console.is_terminal:
-        yield _lines(console.print)
+        yield progress_lines(console.print)
         return
     columns = (TextColumn("{task.description}"), BarColumn(24), MofNCompleteColumn())
     with Bars(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console, transient=True) as bars:
@@ -35,7 +35,8 @@ def progress_bar() -> Iterator[Progress]:
         yield report
 
 
-def _lines(say: Callable[[str], None]) -> Progress:
+def progress_lines(say: Callable[[str], None]) -> Progress:
+    """A `Progress` that says a line every ten seconds, for work beside which another bar is drawn."""
     last: dict[str, float] = {}
 
     def report(what: str, done: int, of: int) -> None:
