@@ -16,7 +16,7 @@ from dope.lowshot.cell_store import GIB, CellStore, SpillFile
 from dope.lowshot.embedding import Embedder
 from dope.lowshot.encoding import ViewCells
 from dope.lowshot.episodes import Episodes, Indices
-from dope.lowshot.matching import BestShots, query_cells, score_support
+from dope.lowshot.matching import BestShots, QueryDescriptors, query_cells
 from dope.lowshot.work import Work
 
 _TRIED = 32  # views written to disk before it is judged whether encoding them again would take less time
@@ -77,6 +77,7 @@ class _QueryCells:
         self._keys = work.views.columns["key"]
         self._norms = torch.empty(len(views), work.matching.points)
         self._descriptors: Tensor | None = None  # allocated with the first view, which tells D
+        self._ready: QueryDescriptors | None = None  # once all are added
         self._fallbacks = 0
         self.room_left = work.memory_gib * GIB
 
@@ -90,13 +91,13 @@ class _QueryCells:
         self._descriptors[row] = cells.at(chosen).to(self._descriptors.device)
         self._norms[row] = torch.from_numpy(norm_map.ravel()[chosen])
 
-    @torch.inference_mode()
     def score(self, view: int, cells: ViewCells, best: BestShots) -> None:
         """Score a support view against the query views that need it."""
-        assert self._descriptors is not None, "queries are added before anything is scored"
+        if self._ready is None:
+            assert self._descriptors is not None, "queries are added before anything is scored"
+            self._ready = QueryDescriptors(self._descriptors, self._norms)
         needing = best.queries_of(view)
-        rows = np.searchsorted(self._views, needing)
-        scores = score_support(self._descriptors, self._norms, cells, rows)
+        scores = self._ready.scores(cells, np.searchsorted(self._views, needing))
         if not np.isfinite(scores).all():  # of cells that were projected only now
             raise self._work.not_finite(view)
         best.add(view, needing, scores)
