@@ -19,7 +19,8 @@ from dope.lowshot.episodes import Episodes, Indices
 from dope.lowshot.matching import BestShots, QueryDescriptors, query_cells
 from dope.lowshot.work import Work
 
-_TRIED = 32  # views written to disk before it is judged whether encoding them again would take less time
+_TRIED = 32  # views written to the disk between judgements whether that is still the thing to do
+_LEAVE_FREE = GIB  # bytes of the disk that are left to others
 
 
 def classify_locally(embedder: Embedder, episodes: Sequence[Episodes], work: Work) -> list[Indices]:
@@ -42,6 +43,7 @@ def classify_locally(embedder: Embedder, episodes: Sequence[Episodes], work: Wor
         queries = _QueryCells(work, query_views, spill)
         store = CellStore(None if work.spill == "never" else spill)
         again: list[int] = []
+        judged = 0
         started = time.perf_counter()
         with work.encoding():
             for i, (view, cells) in enumerate(work.cells(embedder, needed)):
@@ -49,11 +51,12 @@ def classify_locally(embedder: Embedder, episodes: Sequence[Episodes], work: Wor
                     queries.add(view, cells)
                 if is_support[i] and not store.put(view, cells, queries.room_left):
                     again.append(view)
-                if store.spilled == _TRIED and work.spill == "auto":
-                    encode_seconds = (time.perf_counter() - started - store.spill_seconds) / (i + 1)
-                    # written once and read once
-                    if 2 * store.spill_seconds / _TRIED > encode_seconds:
+                if work.spill == "auto" and store.spilled == judged + _TRIED:
+                    judged = store.spilled
+                    encoding = (time.perf_counter() - started - store.spill_seconds) / (i + 1)
+                    if reason := _why_not_spill(store.spill_seconds / judged, encoding, spill.free):
                         store.stop_spilling()
+                        work.notes.append(f"{reason}: views that --memory has no room for were encoded twice")
         done, total = 0, len(best.support_views)
         with work.matching_time():
             for view, cells in store.take_all():
@@ -66,6 +69,21 @@ def classify_locally(embedder: Embedder, episodes: Sequence[Episodes], work: Wor
         spill.close()
     queries.say_fallbacks()
     return best.predictions()
+
+
+def _why_not_spill(spill_seconds: float, encode_seconds: float, free: int) -> str:
+    """Why views should no longer wait on the disk, or nothing.
+
+    Args:
+        spill_seconds: wall time of writing a view to the disk.
+        encode_seconds: of encoding it again.
+        free: bytes that the disk has left.
+    """
+    if free < _LEAVE_FREE:
+        return "the disk of --cache is nearly full"
+    if 2 * spill_seconds > encode_seconds:  # written once and read once
+        return "the disk of --cache is slower than the network"
+    return ""
 
 
 class _QueryCells:
