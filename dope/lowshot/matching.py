@@ -131,16 +131,18 @@ def best_similarities(
 
 def _row_maxima(queries: Tensor, cells: Tensor) -> Tensor:
     """max over M of queries (R, D) @ cells (M, D)^T."""
-    cells = cells.T
-    step = max(1, _SIMILARITIES // cells.shape[1]) if queries.device.type == "cpu" else len(queries)
-    if len(queries) <= step:
-        return (queries @ cells).amax(1)
-    best = queries.new_empty(len(queries))
-    buffer = queries.new_empty(step, cells.shape[1])
-    for start in range(0, len(queries), step):
-        part = queries[start : start + step]
-        torch.amax(torch.mm(part, cells, out=buffer[: len(part)]), 1, out=best[start : start + step])
-    return best
+    if queries.device.type != "cpu":
+        return (queries @ cells.T).amax(1)
+    # NumPy's matrix products are the faster ones on CPUs for which PyTorch's library was not made
+    rows, columns = queries.numpy(), cells.numpy().T
+    step = max(1, _SIMILARITIES // len(cells))
+    buffer = np.empty((min(step, len(rows)), len(cells)), np.float32)
+    best = np.empty(len(rows), np.float32)
+    for start in range(0, len(rows), step):
+        part = rows[start : start + step]
+        similarities = np.matmul(part, columns, out=buffer[: len(part)])
+        np.max(similarities, axis=1, out=best[start : start + step])
+    return torch.from_numpy(best)
 
 
 class QueryDescriptors:
@@ -172,7 +174,7 @@ class QueryDescriptors:
             descriptors = self.descriptors[part].to(device).flatten(0, 1)
             norms = self.norms[part.to(self.norms.device)].to(device).flatten()
             screening = None
-            if self._screen is not None and self._coordinates is not None:
+            if self._screen is not None and self._coordinates is not None and device.type == "cpu":
                 screening = self._screen, self._coordinates[part].flatten(0, 1)
             best = best_similarities(descriptors, norms, support, screening)
             scores[start : start + _QUERIES] = best.view(len(part), -1).sum(1).cpu().numpy()

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 COLUMNS = (16, 32, 64)  # d + 1 that are tried: whole vectors of the processor
@@ -19,7 +20,7 @@ _LEFT = (
 _SAMPLE = 8192  # descriptors from which the subspace is found
 _SLACK = 2e-5  # of the product of the norms: more than float32 products of unit vectors and of a float32 basis err
 _WORTH = 6  # candidates a query cell beyond which whole products are faster
-_BOUNDS = 1 << 19  # computed at once: 2 MiB, so that they are searched within the cache
+_BOUNDS = 1 << 17  # computed at once: 512 KiB, so that they are searched within the cache
 
 
 class Screen:
@@ -68,29 +69,28 @@ class Screen:
             coordinates: (R, d + 1) of the queries.
             cells: (M, D) of length at most 1.
         """
-        of_cells = self.coordinates(cells)
+        of_cells = self.coordinates(cells).T.contiguous().numpy()
+        of_queries = coordinates.numpy()
         best = queries.new_empty(len(queries))
         step = max(1, _BOUNDS // len(cells))
-        bounds = queries.new_empty(min(step, len(queries)), len(cells))
+        bounds = np.empty((min(step, len(queries)), len(cells)), np.float32)
         for start in range(0, len(queries), step):
             part = slice(start, start + step)
-            above = torch.mm(coordinates[part], of_cells.T, out=bounds[: len(queries[part])])
+            above = np.matmul(of_queries[part], of_cells, out=bounds[: len(of_queries[part])])
             best[part] = _maxima(queries[part], norms[part], above, cells)
         return best
 
 
-def _maxima(queries: Tensor, norms: Tensor, bounds: Tensor, cells: Tensor) -> Tensor:
+def _maxima(queries: Tensor, norms: Tensor, bounds: NDArray[np.float32], cells: Tensor) -> Tensor:
     """The greatest dot product (R,) of queries (R, D) with cells (M, D), given `bounds` (R, M) of all of them."""
-    table = bounds.numpy()
-    # NumPy compares many at a time, which PyTorch does not where it wants the place of a maximum
-    likely = torch.from_numpy(table.argmax(1))
+    likely = torch.from_numpy(bounds.argmax(1))
     best = (queries * cells[likely]).sum(1)
     least = best - _SLACK * norms
     # "not less" keeps NaN
-    candidates = np.flatnonzero(~(table < least.numpy()[:, None]))
-    if len(candidates) > _WORTH * len(table):
+    candidates = np.flatnonzero(~(bounds < least.numpy()[:, None]))
+    if len(candidates) > _WORTH * len(bounds):
         return (queries @ cells.T).amax(1)
-    rows, places = np.divmod(candidates, table.shape[1])
+    rows, places = np.divmod(candidates, bounds.shape[1])
     other = places != likely.numpy()[rows]
     if other.any():
         row, place = torch.from_numpy(rows[other]), torch.from_numpy(places[other])
