@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from dope import __version__
-from dope.commands import evaluate, figure, train
+from dope.commands import evaluate, figure, results, train
 from dope.common.errors import DopeError, UsageError
 from pipeline.commands import app as prep
 
@@ -41,6 +41,7 @@ app = typer.Typer(
 app.add_typer(prep, name="prep")
 app.command("train")(train)
 app.command("eval")(evaluate)
+app.command("results")(results)
 app.command("figure")(figure)
 
 

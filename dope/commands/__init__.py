@@ -1,7 +1,8 @@
-"""`dope train`, `dope eval` and `dope figure`: parse, call one function, print. Heavy imports happen inside."""
+"""`dope train`, `eval`, `results` and `figure`: parse, call one function, print. Heavy imports happen inside."""
 
 from dope.commands.evaluate import evaluate
 from dope.commands.figure import figure
+from dope.commands.results import results
 from dope.commands.train import train
 
-__all__ = ["evaluate", "figure", "train"]
+__all__ = ["evaluate", "figure", "results", "train"]

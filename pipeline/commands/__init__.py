@@ -9,6 +9,7 @@ from pipeline.commands.colmap import colmap
 from pipeline.commands.correspond import correspond
 from pipeline.commands.export import export
 from pipeline.commands.masks import masks
+from pipeline.commands.photos import photos
 from pipeline.commands.render import render
 from pipeline.commands.report import report
 from pipeline.commands.run import run
@@ -35,6 +36,8 @@ app = typer.Typer(
 
       4. [bold]dope prep shards[/]      WebDataset tars and a Parquet index, ready for [bold]dope train[/]
 
+    [bold]dope prep photos[/] packs labelled photos that need no cameras, for evaluation alone.
+
     [bold]dope prep status WORK[/] tells how far each sequence came; [bold]dope prep report WORK[/] shows it on a page;
     [bold]dope prep export WORK[/] hands cameras to other tools.
 
@@ -51,6 +54,7 @@ app.command("render")(render)
 app.command("masks")(masks)
 app.command("correspond")(correspond)
 app.command("shards")(shards)
+app.command("photos")(photos)
 app.command("status")(status)
 app.command("report")(report)
 app.command("export")(export)

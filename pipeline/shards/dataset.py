@@ -72,7 +72,7 @@ def write_shards(
     mark = settings.config_hash(
         {"format": FORMAT, "config": settings.to_dict(config), "sequences": marks, "left_out": left_out}
     )
-    if not overwrite and (there := _same_dataset(out, mark)):
+    if not overwrite and (there := same_dataset(out, mark)):
         clear_parts(out, mark)
         return {**there, "skipped": True}
     plan, details = plan_tars(catalogue, config)
@@ -90,7 +90,7 @@ def write_shards(
 
     def finish(folder: Path, written: list[WrittenShard]) -> None:
         details["bytes"] = sum(shard.entry["bytes"] for shard in written)
-        _write_tables(folder, written, {"fingerprint": mark, "counts": details, "settings": settings.to_dict(config)})
+        write_tables(folder, written, {"fingerprint": mark, "counts": details, "settings": settings.to_dict(config)})
 
     if share.count > 1:
         waiting_for = write_part(out, mark, plan, share, write, finish)
@@ -98,7 +98,7 @@ def write_shards(
             clear_parts(out)
         return {**details, "skipped": False, "waiting_for": waiting_for}
     with holding_output(out, wait=wait):
-        if not overwrite and (there := _same_dataset(out, mark)):  # written by the one that was waited for
+        if not overwrite and (there := same_dataset(out, mark)):  # written by the one that was waited for
             return {**there, "skipped": True}
         with files.atomic_folder(out) as folder:
             finish(folder, [write(folder / tar.name, tar) for tar in plan])
@@ -106,7 +106,7 @@ def write_shards(
     return {**details, "skipped": False}
 
 
-def _write_tables(folder: Path, written: list[WrittenShard], facts: dict[str, Any]) -> None:
+def write_tables(folder: Path, written: list[WrittenShard], facts: dict[str, Any]) -> None:
     """index.parquet, views.parquet and, last, dataset.json beside the tars."""
     for name, kind in (("index.parquet", "pairs"), ("views.parquet", "views")):
         rows = pa.concat_tables(
@@ -178,7 +178,7 @@ def _indexed_samples(folder: Path) -> dict[str, int]:
 def check_output(out: Path, config: ShardsConfig) -> None:
     """Raise `UsageError` for settings that make no sense, or an `out` that must not be replaced."""
     _check_settings(config)
-    _check_folder(out.resolve())
+    check_folder(out.resolve())
 
 
 def _check_settings(config: ShardsConfig) -> None:
@@ -189,7 +189,7 @@ def _check_settings(config: ShardsConfig) -> None:
         raise UsageError(f"must lie between 0 and 1, not {config.val_fraction}", where="val_fraction", remedy=remedy)
 
 
-def _check_folder(out: Path) -> None:
+def check_folder(out: Path) -> None:
     """Writing replaces `out` as a whole: refuse to do so to anything that is not a dataset."""
     if out.exists() and not out.is_dir():
         raise UsageError("is a file, not a folder", where=out, remedy="Choose another --out")
@@ -203,7 +203,7 @@ def _check_folder(out: Path) -> None:
         raise UsageError(f"holds files that are not shards ({listed})", where=out, remedy=remedy)
 
 
-def _same_dataset(out: Path, mark: str) -> dict[str, Any] | None:
+def same_dataset(out: Path, mark: str) -> dict[str, Any] | None:
     """The counts of the dataset in `out` if it is whole and of this fingerprint."""
     try:
         manifest = files.read_json(out / "dataset.json")

@@ -19,7 +19,8 @@ def held_out_arc(
         frames: (V,) frame numbers of the views, ascending.
         pairs: (P, 2) frame numbers.
         fraction: share of the views to hold out.
-        seed: chooses among the arcs that hold at least half as many pairs as the best.
+        seed: chooses among the arcs that hold at least half as many pairs as the best; where no view is of two pairs,
+            among those of them that leave the fewest pairs with one view on either side.
 
     Returns:
         (V,) True = held out; all False where no arc leaves a pair on either side.
@@ -37,6 +38,9 @@ def held_out_arc(
     if n_val.max() == 0:
         return none
     good = starts[n_val * 2 >= n_val.max()]
+    if len(np.unique(pairs)) == pairs.size:  # renders, where each view is of one pair: an arc need not part any
+        parted = len(pairs) - n_val[good] - n_train[good]
+        good = good[parted == parted.min()]
     start = int(good[seeds.derive_seed("held-out arc", *seed) % len(good)])
     none[start : start + length] = True
     return none

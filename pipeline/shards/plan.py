@@ -83,12 +83,12 @@ def plan_tars(catalogue: Catalogue, config: ShardsConfig) -> tuple[Plan, dict[st
     rows = np.arange(len(sequence)) - catalogue.pair_starts[sequence]
     plan: Plan = []
     for split, chosen in places.items():
-        for name, part in _even_parts(split, len(chosen), config.samples_per_shard):
+        for name, part in even_parts(split, len(chosen), config.samples_per_shard):
             of = chosen[part]
             plan.append(TarPlan(name, "pairs", sequence[of], rows[of], np.full(len(of), split == "val")))
     owner = np.repeat(np.arange(len(catalogue), dtype=np.int32), np.diff(catalogue.view_starts))
     view_rows = np.arange(len(owner)) - catalogue.view_starts[owner]
-    for name, part in _even_parts("views", len(owner), config.samples_per_shard):
+    for name, part in even_parts("views", len(owner), config.samples_per_shard):
         plan.append(TarPlan(name, "views", owner[part], view_rows[part], held[part]))
     return plan, details
 
@@ -152,7 +152,7 @@ def _shuffled_pairs(catalogue: Catalogue, seed: int) -> NDArray[np.int64]:
     return order
 
 
-def _even_parts(kind: str, n: int, most: int) -> Iterator[tuple[str, slice]]:
+def even_parts(kind: str, n: int, most: int) -> Iterator[tuple[str, slice]]:
     """Names and parts of the tars that n samples are spread over."""
     n_shards = -(-n // most)
     for k in range(n_shards):

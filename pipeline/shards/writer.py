@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import pyarrow as pa
@@ -161,6 +161,13 @@ class ViewSample:
         return sample, {**row, "mask_share": view["mask_share"]}
 
 
+class Sample(Protocol):
+    """What can be written."""
+
+    def encode(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """The sample as WebDataset wants it, and its row in the table (without shard, offset and size)."""
+
+
 def camera_facts(view: dict[str, Any]) -> dict[str, Any]:
     """K (3, 3), R (3, 3) and t (3,) of a row of views.parquet as nested lists; every float as it is."""
     return {
@@ -210,7 +217,7 @@ class HashingFile:
         self.file.close()
 
 
-def write_tar(path: Path, kind: Kind, samples: Iterable[PairSample | ViewSample], name: str) -> WrittenShard:
+def write_tar(path: Path, kind: Kind, samples: Iterable[Sample], name: str) -> WrittenShard:
     """Write one shard and sync it; equal samples give equal bytes.
 
     Args:
@@ -242,7 +249,7 @@ def write_tar(path: Path, kind: Kind, samples: Iterable[PairSample | ViewSample]
     return WrittenShard(name, kind, entry, pa.Table.from_pylist(rows, SCHEMAS[kind]))
 
 
-def _encode(sample: PairSample | ViewSample) -> tuple[dict[str, Any], dict[str, Any]]:
+def _encode(sample: Sample) -> tuple[dict[str, Any], dict[str, Any]]:
     try:
         return sample.encode()
     except FileNotFoundError as error:

@@ -134,3 +134,13 @@ def test_a_marker_without_an_outline_or_with_a_damaged_one_is_made_up_for_by_the
             assert columns(again[0]) == columns(whole[0]) and again[1] == whole[1]
     finally:
         files.write_json(marker, values)
+
+
+def test_no_pair_of_views_rendered_together_is_lost_to_the_holdout() -> None:
+    frames, pairs = np.arange(20), np.arange(20).reshape(10, 2)
+    for object in range(30):
+        held = held_out_arc(frames, pairs, 0.2, 0, f"object {object}")
+        assert held.sum() == 4 and (held[pairs[:, 0]] == held[pairs[:, 1]]).all()
+    fewer = np.delete(pairs, 4, axis=0)  # a pair was dropped, its views are there
+    held = held_out_arc(frames, fewer, 0.25, 0, "object")
+    assert (held[fewer[:, 0]] == held[fewer[:, 1]]).all() and held.any()

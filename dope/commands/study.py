@@ -1,0 +1,92 @@
+"""`dope study`: the paper's methods or ablations, trained and evaluated alike."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dope.commands.options import Shards, check_choice
+from dope.study.variants import KINDS
+
+
+def study(
+    shards: Shards,
+    test: Annotated[str, typer.Option(help="Shards whose views are evaluated.", show_default=False)],
+    out: Annotated[Path, typer.Option("--out", help="STUDY: runs/, table.md.", show_default=False)],
+    kind: Annotated[str, typer.Option(help="methods, ablations or all.")] = "all",
+    only: Annotated[
+        list[str] | None, typer.Option("--only", help="Only these lines of the table; repeatable.", show_default=False)
+    ] = None,
+    labelled: Annotated[
+        str | None, typer.Option(help="Shards with classes, for the supervised methods.", show_default=False)
+    ] = None,
+    predicted_masks: Annotated[
+        str | None, typer.Option(help="SHARDS once more, with masks of a segmentation tool.", show_default=False)
+    ] = None,
+    split_file: Annotated[
+        Path | None,
+        typer.Option(help="Base classes for the supervised methods, test classes for all.", show_default=False),
+    ] = None,
+    preset: Annotated[str, typer.Option(help="Of all runs, see `dope train`.")] = "nano",
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="A setting of all runs; repeatable.", show_default=False),
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Runs of each, with seeds of their own.")] = 1,
+    ways: Annotated[list[int] | None, typer.Option(help="Classes an episode.  [default: 5 10]")] = None,
+    shots: Annotated[list[int] | None, typer.Option(help="Labelled views a class.  [default: 1 5]")] = None,
+    queries: Annotated[int, typer.Option(help="Queries a class.")] = 15,
+    episodes: Annotated[int, typer.Option(help="Episodes a setting.")] = 2500,
+    jobs: Annotated[int, typer.Option(min=1, help="Runs at a time; they share the CPUs.")] = 1,
+) -> None:
+    """Train and evaluate the paper's methods and the ablations of DOPE, all alike, and print their table.
+
+    Every line is a run as `dope train` and `dope eval` make it, in STUDY/runs. Run it again to go on: what is done
+    is not done again. A line that fails is named, the others go on; the exit code is then 1.
+
+    Examples:
+
+      dope study shards --test test_shards --out study --kind ablations
+
+      dope study renders --labelled labelled --test labelled --split-file split.json --out study --seeds 3 --jobs 2
+    """
+    from rich.console import Console
+
+    from dope.study.run import StudyConfig, run_study
+    from dope.study.table import study_table
+
+    check_choice(kind, "--kind", tuple(KINDS))
+    variants = KINDS[kind]
+    for name in only or []:
+        check_choice(name, "--only", tuple(variant.name for variant in variants))
+    if only:
+        variants = tuple(variant for variant in variants if variant.name in only)
+    evaluation = [part for way in ways or [5, 10] for part in ("--ways", str(way))]
+    evaluation += [part for shot in shots or [1, 5] for part in ("--shots", str(shot))]
+    evaluation += ["--queries", str(queries), "--episodes", str(episodes)]
+    base: tuple[str, ...] = ()
+    if split_file is not None:
+        from dope.lowshot.splits import read_split_file
+
+        base = read_split_file(split_file).base
+        evaluation += ["--split-file", str(split_file)]
+    sources = {"pairs": shards, "labelled": labelled, "predicted": predicted_masks}
+    config = StudyConfig(
+        {name: place for name, place in sources.items() if place is not None},  # type: ignore[misc]
+        test,
+        preset,
+        tuple(set_ or ()),
+        base,
+        tuple(evaluation),
+        tuple(range(seeds)),
+        jobs,
+    )
+    console = Console(highlight=False, stderr=True)
+    outcome = run_study(variants, config, out, lambda text: console.print(text, markup=False, soft_wrap=True))
+    if outcome.done:
+        typer.echo(study_table(outcome.done, out), nl=False)
+    for name, why in outcome.failed.items():
+        console.print(f"{name}: {why}", markup=False, soft_wrap=True)
+    raise typer.Exit(1 if outcome.failed else 0)

@@ -1,0 +1,1 @@
+"""Studies: many runs that differ in one thing each, trained and evaluated alike, and the table of them."""
