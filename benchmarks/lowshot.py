@@ -241,6 +241,7 @@ def evaluation_figure(
     encoding: tuple[float, float], naive_matching: dict[tuple[int, int], float], sample: int, directions: int
 ) -> None:
     """Print the cost of the whole evaluation, scaled from a sample of its support views."""
+    kind = f"{directions} directions" if directions < DIM else "full rank"
     views = population(VIEWS)
     configs = [EpisodeConfig(ways=w, shots=s, queries=QUERIES, episodes=EPISODES) for w, s in SETTINGS]
     drawing, episodes = measured(lambda: [sample_episodes(views, config) for config in configs])
@@ -280,7 +281,7 @@ def evaluation_figure(
         EPISODES * (w * (s + QUERIES) * encoding[1] + naive_matching[w, s]) for w, s in SETTINGS
     ) / 3600  # fmt: skip
     say(
-        f"evaluation, four settings x 2,500 episodes, {directions} directions", value=value, unit="CPU h",
+        f"evaluation, four settings x 2,500 episodes, {kind}", value=value, unit="CPU h",
         peer=PEER_HOURS,
         times_less_than_peer=PEER_HOURS / value, goal=GOAL_TIMES, naive=naive, times_less_than_naive=naive / value,
         scaled_from={
