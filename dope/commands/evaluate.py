@@ -30,8 +30,8 @@ def evaluate(
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for results.parquet.", show_default="RUN/eval, or eval/ENCODER")
     ] = None,
-    ways: Annotated[list[int] | None, typer.Option(help="Classes an episode; repeatable.  [default: 5]")] = None,
-    shots: Annotated[list[int] | None, typer.Option(help="Labelled views a class; repeatable.  [default: 1]")] = None,
+    ways: Annotated[list[int] | None, typer.Option(help="Classes an episode (5); repeatable.")] = None,
+    shots: Annotated[list[int] | None, typer.Option(help="Labelled views a class (1); repeatable.")] = None,
     queries: Annotated[int, typer.Option(help="Queries a class.")] = 15,
     episodes: Annotated[int, typer.Option(help="Episodes a setting.")] = 2500,
     classes: Annotated[
@@ -52,7 +52,7 @@ def evaluate(
         Path | None,
         typer.Option(
             "--split-file",
-            help='Splits of your own: {"base": [names], "splits": [{"val": [names], "test": [names]}, ...]}',
+            help='Splits of your own: {"base": \\[names], "splits": [{"val": \\[names], "test": \\[names]}, ...]}',
             show_default=False,
         ),
     ] = None,
@@ -101,8 +101,8 @@ def evaluate(
         Path | None,
         typer.Option(
             "--cache",
-            help="Folder on that disk; nothing stays there.  [default: the temporary folder]",
-            show_default=False,
+            help="Folder on that disk; nothing stays there.",
+            show_default="the temporary folder",
         ),
     ] = None,
     encoder: Annotated[

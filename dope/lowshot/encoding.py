@@ -19,6 +19,7 @@ from torch import Tensor
 from dope.networks import NetworkOutput
 from dope.networks.dope import CELLS_AT_ONCE
 
+_CELLS_ON_CPU = 2048  # projected at once: 8 MiB of 1024 channels, so that less goes through memory
 LIKELY_OBJECT = 0.3  # cells of at least this soft mask are projected when a view is encoded
 
 
@@ -166,5 +167,6 @@ class _Describe:
 
     @torch.inference_mode()
     def __call__(self, features: Tensor, norms: NDArray[np.float32]) -> Tensor:
-        parts = [F.normalize(self._network.project(part).float(), dim=1) for part in features.split(CELLS_AT_ONCE)]
+        step = _CELLS_ON_CPU if features.device.type == "cpu" else CELLS_AT_ONCE
+        parts = [F.normalize(self._network.project(part).float(), dim=1) for part in features.split(step)]
         return torch.cat(parts) * torch.from_numpy(norms).to(features.device)[:, None]

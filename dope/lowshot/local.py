@@ -106,7 +106,10 @@ class _QueryCells:
         if self._descriptors is None:
             self._descriptors = self._allocate(cells.dim)
         row = int(np.searchsorted(self._views, view))
-        self._descriptors[row] = cells.at(chosen).to(self._descriptors.device)
+        descriptors = cells.at(chosen)
+        if not descriptors.isfinite().all():  # of cells that were projected only now
+            raise self._work.not_finite(view)
+        self._descriptors[row] = descriptors.to(self._descriptors.device)
         self._norms[row] = torch.from_numpy(norm_map.ravel()[chosen])
 
     def score(self, view: int, cells: ViewCells, best: BestShots) -> None:

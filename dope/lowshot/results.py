@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import fcntl
 import typing
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -93,15 +95,27 @@ class ResultRow:
 def append_rows(path: Path, rows: Iterable[ResultRow]) -> list[ResultRow]:
     """Add rows to a .parquet or .json file, in order; a row measured before is replaced. Returns all rows.
 
+    Several processes may do so at once: each adds to what the others wrote.
+
     Raises:
         UsageError: another suffix.
         BadInput: the file is there and cannot be read.
     """
     _check_suffix(path)
-    merged = {_identity(row): row for row in (read_rows(path) if path.exists() else [])}
-    merged |= {_identity(row): row for row in rows}
-    _write(path, list(merged.values()))
+    with _alone(path):
+        merged = {_identity(row): row for row in (read_rows(path) if path.exists() else [])}
+        merged |= {_identity(row): row for row in rows}
+        _write(path, list(merged.values()))
     return list(merged.values())
+
+
+@contextmanager
+def _alone(path: Path) -> Iterator[None]:
+    """Wait until no other process adds to the file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.with_name(f".{path.name}.lock").open("a") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)  # let go when the file is closed, also by the end of the process
+        yield
 
 
 def read_rows(path: Path) -> list[ResultRow]:

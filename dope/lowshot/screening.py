@@ -39,7 +39,10 @@ class Screen:
         if descriptors.device.type != "cpu" or len(descriptors) == 0:
             return None
         some = descriptors[:: max(1, len(descriptors) // _SAMPLE)]
-        energies, directions = torch.linalg.eigh(some.T @ some)
+        try:
+            energies, directions = torch.linalg.eigh(some.T @ some)
+        except torch.linalg.LinAlgError:  # does not converge: whole products do without
+            return None
         total = float(energies.sum())
         for columns in COLUMNS:
             d = columns - 1

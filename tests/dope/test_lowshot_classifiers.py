@@ -236,3 +236,13 @@ def test_rows_hold_what_the_columns_say(shards: Path) -> None:
     (row,) = run(MeanColour(), shards).rows
     assert {field.name for field in dataclasses.fields(row)} >= {"method", "run", "table", "table_split", "part"}
     assert (row.run, row.table, row.table_split, row.part) == ("", "", -1, "all")
+
+
+def test_views_that_look_the_same_get_other_copies(shards: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else the copies of all shots would share what is drawn."""
+    first = ViewShards(shards)
+    image, mask = first.image(0), first.mask(0)
+    monkeypatch.setattr(ViewShards, "image", lambda self, index: image)
+    monkeypatch.setattr(ViewShards, "mask", lambda self, index: mask)
+    copies = copies_of(shards, 16, count=1)[:, 0]
+    assert len(np.unique(copies.round(5), axis=0)) > len(copies) // 2

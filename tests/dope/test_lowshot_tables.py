@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ from typer.testing import CliRunner
 from cli import app
 from dope.checkpoints import save_checkpoint
 from dope.common.errors import BadInput, UsageError
+from dope.lowshot import results
 from dope.lowshot.episodes import EpisodeConfig
 from dope.lowshot.evaluate import EvaluationConfig, evaluate
 from dope.lowshot.results import ResultRow, mean_over_splits, read_rows
@@ -205,3 +208,26 @@ def test_old_result_rows_without_the_new_columns_are_read(tmp_path: Path, shards
         -1,
         "all",
     )
+
+
+def test_evaluations_that_end_at_once_lose_no_rows(
+    tmp_path: Path, shards: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = evaluate(None, shards, config(), network=NETWORK).rows[0]
+    real = results._write
+
+    def slowly(*arguments: Any) -> None:
+        time.sleep(0.05)
+        real(*arguments)
+
+    monkeypatch.setattr(results, "_write", slowly)
+    path = tmp_path / "results.json"
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda seed: results.append_rows(path, [replace(row, seed=seed)]), range(4)))
+    assert sorted(one.seed for one in read_rows(path)) == [0, 1, 2, 3]
+
+
+def test_the_help_shows_what_a_split_file_is() -> None:
+    text = CliRunner().invoke(app, ["eval", "--help"], env={"COLUMNS": "200"}).output
+    assert '{"base": [names], "splits": [{"val": [names], "test": [names]}, ...]}' in text
+    assert "Classes an episode (5)" in text and "[default: (the temporary folder)]" in text
