@@ -1,4 +1,4 @@
-"""`dope train`, `eval`, `results`, `study` and `figure`: parse, call one function, print. Heavy imports happen inside."""
+"""`dope train`, `eval`, `results`, `study`, `figure`: parse, call one function, print. Heavy imports happen inside."""
 
 from dope.commands.evaluate import evaluate
 from dope.commands.figure import figure
