@@ -1,4 +1,4 @@
-"""What each rank of test_methods_ranks does: fixed batches of a method in, losses, gradients and queue out. By torchrun."""
+"""What each rank of test_methods_ranks does: fixed batches in, losses, gradients and queue out. Run by torchrun."""
 
 from __future__ import annotations
 
