@@ -187,7 +187,12 @@ def test_settings_that_make_no_sense_are_refused() -> None:
 
 def test_presets_are_the_papers() -> None:
     paper, abc = (load_config(name, method="vispe_moco") for name in ("paper_shapenet", "paper_abc"))
-    assert (paper.moco.queue, paper.moco.head, paper.moco.temperature, paper.momentum) == (4096, (1024, 128), 0.2, 0.999)
+    assert (paper.moco.queue, paper.moco.head, paper.moco.temperature, paper.momentum) == (
+        4096,
+        (1024, 128),
+        0.2,
+        0.999,
+    )
     assert (paper.optimiser.name, paper.optimiser.lr, paper.optimiser.weight_decay) == ("adamw", 1e-4, 1e-2)
     assert (paper.schedule.epochs, paper.data.batch_size) == (3500, 256)
     assert abc.moco.queue == 16384 and abc.schedule == paper.schedule

@@ -63,7 +63,7 @@ def test_a_step_predicts_each_view_from_the_other_without_gradient_to_the_predic
     assert found.keys() == dict(network.named_parameters()).keys()
 
     network.zero_grad()
-    (z1, p1), (z2, p2) = network(batch.images1), network(batch.images2)
+    (_, p1), (_, p2) = network(batch.images1), network(batch.images2)
     with torch.no_grad():
         (target1, _), (target2, _) = network(batch.images1), network(batch.images2)
     loss = -(F.cosine_similarity(p1, target2) + F.cosine_similarity(p2, target1)).mean() / 2
@@ -104,7 +104,9 @@ def test_the_predictor_keeps_its_learning_rate(constant: bool) -> None:
 
 def test_spread_tells_collapse() -> None:
     assert spread(torch.ones(8, 16)).item() == 0
-    assert spread(torch.randn(4096, 64, generator=torch.Generator().manual_seed(0))).item() == pytest.approx(1, abs=0.02)
+    assert spread(torch.randn(4096, 64, generator=torch.Generator().manual_seed(0))).item() == pytest.approx(
+        1, abs=0.02
+    )
 
 
 def test_one_pair_a_rank_is_refused(shards: Path) -> None:
@@ -134,7 +136,13 @@ def test_presets_are_the_papers() -> None:
     assert (config.optimiser.name, config.optimiser.lr, config.optimiser.momentum) == ("sgd", 0.05, 0.9)
     assert (config.optimiser.weight_decay, config.data.batch_size, config.schedule.shape) == (1e-4, 256, "cosine")
     colours = config.augmentation
-    assert (colours.colour_p, colours.jitter_p, colours.grey_p, colours.blur_p, colours.flip_p) == (0, 0.8, 0.2, 0.5, 0.5)
+    assert (colours.colour_p, colours.jitter_p, colours.grey_p, colours.blur_p, colours.flip_p) == (
+        0,
+        0.8,
+        0.2,
+        0.5,
+        0.5,
+    )
     assert colours.jitter == (0.4, 0.4, 0.4, 0.1) and colours.background_removal == "paired"
     assert (config.simsiam.projector, config.simsiam.predictor) == (2048, 512)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter
 from dataclasses import replace
@@ -12,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from tiny_drawn import draw_views
+from tiny_drawn import draw_views, with_manifest
 from tiny_method_runs import better_than_chance, same_after_a_stop, tiny_method
 from tiny_views import write_views
 from torch import Tensor
@@ -29,13 +28,6 @@ from dope.order import Place
 from dope.state import new_state
 
 ALONE = Ranks(0, 1, torch.device("cpu"))
-
-
-def with_manifest(folder: Path) -> Path:
-    shard = folder / "views-000000.tar"
-    facts = {"bytes": shard.stat().st_size, "sha256": "0" * 64}
-    (folder / "dataset.json").write_text(json.dumps({"shards": {shard.name: facts}}))
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -244,5 +236,5 @@ def test_a_run_that_was_stopped_ends_with_the_same_weights_and_queue(shards: Pat
 
 @pytest.mark.timeout(240)
 def test_it_learns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    shards = with_manifest(draw_views(tmp_path / "views", monkeypatch, categories=6, objects=5))
-    better_than_chance(shards, tmp_path / "run", "supmoco")
+    shards = draw_views(tmp_path / "views", monkeypatch, categories=8, objects=6, held_out=6)
+    better_than_chance(shards, tmp_path / "run", "supmoco", "schedule.max_steps=60")

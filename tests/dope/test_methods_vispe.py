@@ -60,7 +60,9 @@ def test_the_losses_are_those_of_a_loop(objects: list[int]) -> None:
     found = vispe_losses(first, second, torch.arange(6), second, numbers, 0.3)
     assert [value.item() for value in found] == pytest.approx(expected, abs=1e-12)
     # the parts of the batch that two ranks hold
-    halves = [vispe_losses(first[r], second[r], torch.arange(6)[r], second, numbers, 0.3) for r in (slice(3), slice(3, 6))]
+    halves = [
+        vispe_losses(first[r], second[r], torch.arange(6)[r], second, numbers, 0.3) for r in (slice(3), slice(3, 6))
+    ]
     assert [sum(h[k].item() for h in halves) / 2 for k in (0, 1)] == pytest.approx(expected, abs=1e-12)
 
 

@@ -45,7 +45,7 @@ def same_after_a_stop(shards: Path, folder: Path, config: TrainConfig) -> None:
 
 
 def better_than_chance(shards: Path, out: Path, method: str, *overrides: str) -> None:
-    """The lower end of the 95% confidence interval (Wilson) is above chance, and above the untrained network's score."""
+    """The lower end of the 95% confidence interval (Wilson) is above chance and above the untrained network's score."""
     result = train(shards, out, load_config("nano", None, [*LEARNING, *overrides], method=method))
     last = read_checkpoint(out)["validation"]
     assert result["score"] == last[result["score_name"]]
