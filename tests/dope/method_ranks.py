@@ -1,4 +1,4 @@
-"""What each rank of test_methods_ranks does: fixed batches in, losses, gradients and queue out. Run by torchrun."""
+"""What each rank of test_methods_ranks does, by torchrun: fixed batches in, losses, gradients and queue out."""
 
 from __future__ import annotations
 
