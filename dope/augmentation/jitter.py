@@ -82,7 +82,7 @@ def change_colours(images: Tensor, plan: JitterPlan) -> None:
         images[rows] = some
     rows = rows_where(plan.blurred)
     if rows is not None:
-        images[rows] = blur(images[rows], plan.kernels[rows])
+        images[rows] = blur(images[rows], plan.kernels[rows]).clamp_(0, 1)  # kernels of sum 1 round to a bit more
 
 
 def blur(images: Tensor, kernels: Tensor) -> Tensor:

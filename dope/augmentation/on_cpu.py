@@ -117,6 +117,7 @@ def jittered(pixels: Pixels, plan: JitterPlan | None, i: int) -> Pixels:
     if plan.blurred[i]:
         kernel = plan.kernels[i].numpy(force=True)
         pixels = cv2.sepFilter2D(pixels, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT_101)
+        torch.from_numpy(pixels).clamp_(0, 1)
     return pixels
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import method_ranks
 import pytest
 import torch
 from test_distributed import torchrun
+from tiny_drawn import with_manifest
 from tiny_shards import write_shards
 from tiny_views import write_views
 
@@ -26,11 +26,7 @@ def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def views(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = write_views(tmp_path_factory.mktemp("views"), categories=4, objects=5, size=32)
-    shard = folder / "views-000000.tar"
-    facts = {"bytes": shard.stat().st_size, "sha256": "0" * 64}
-    (folder / "dataset.json").write_text(json.dumps({"shards": {shard.name: facts}}))
-    return folder
+    return with_manifest(write_views(tmp_path_factory.mktemp("views"), categories=4, objects=5, size=32))
 
 
 @pytest.fixture(scope="module")

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import colorsys
+import hashlib
+import json
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import tiny_shards
 import tiny_views
@@ -52,7 +56,20 @@ def draw_pairs(folder: Path, monkeypatch: pytest.MonkeyPatch, *, objects: int, h
     )
 
 
-def draw_views(folder: Path, monkeypatch: pytest.MonkeyPatch, *, categories: int, objects: int) -> Path:
-    """Single views, 4 of each object, with classes; the last object of each is held out."""
+def draw_views(folder: Path, monkeypatch: pytest.MonkeyPatch, *, categories: int, objects: int, held_out: int) -> Path:
+    """Single views, 2 of each object, with classes; the last objects of each class are held out."""
     monkeypatch.setattr(tiny_views, "make_pair", drawn_pair)
-    return tiny_views.write_views(folder, categories=categories, objects=objects, views=4, size=32)
+    tiny_views.write_views(folder, categories=categories, objects=objects + held_out, views=2, size=32)
+    rows = pq.read_table(folder / "views.parquet").to_pylist()
+    for row in rows:
+        row["split"] = "train" if int(row["sequence"].rpartition("object")[2]) < objects else "val"
+    pq.write_table(pa.Table.from_pylist(rows), folder / "views.parquet")
+    return with_manifest(folder)
+
+
+def with_manifest(folder: Path) -> Path:
+    """The folder of views, with the dataset.json that training asks for."""
+    shard = folder / "views-000000.tar"
+    facts = {"bytes": shard.stat().st_size, "sha256": hashlib.sha256(shard.read_bytes()).hexdigest()}
+    (folder / "dataset.json").write_text(json.dumps({"shards": {shard.name: facts}}))
+    return folder
