@@ -9,6 +9,7 @@ import hashlib
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -46,6 +47,11 @@ def _cross(mask: Mask) -> None:
     _polygon((-0.25, -1), (-0.25, 1), (0.25, 1), (0.25, -1))(mask)
 
 
+def _gate(mask: Mask) -> None:
+    _polygon((-0.9, -0.9), (0.9, -0.9), (0.9, 0.9), (-0.9, 0.9))(mask)
+    cv2.rectangle(mask, (int(0.68 * R), int(0.76 * R)), (int(1.32 * R), 2 * R), 0, -1)
+
+
 SHAPES: dict[str, Callable[[Mask], None]] = {
     "bar": _polygon((-1, -0.2), (1, -0.2), (1, 0.2), (-1, 0.2)),
     "cross": _cross,
@@ -55,7 +61,7 @@ SHAPES: dict[str, Callable[[Mask], None]] = {
     "triangle": _polygon((0, -1), (1, 0.8), (-1, 0.8)),
     # of the tests alone
     "corner": _polygon((-0.9, -0.9), (-0.3, -0.9), (-0.3, 0.3), (0.9, 0.3), (0.9, 0.9), (-0.9, 0.9)),
-    "gate": _polygon((-0.9, -0.9), (0.9, -0.9), (0.9, 0.9), (0.4, 0.9), (0.4, -0.3), (-0.4, -0.3), (-0.4, 0.9), (-0.9, 0.9)),
+    "gate": _gate,
     "post": _polygon((-0.2, -1), (0.2, -1), (0.2, 1), (-0.2, 1)),
     "star": _star,
     "two": _discs((-0.55, 0), (0.55, 0)),
@@ -65,7 +71,7 @@ BASE, UNSEEN = tuple(SHAPES)[:6], tuple(SHAPES)[6:]
 
 
 def view(shape: str, number: int, seed: int, size: int) -> tuple[NDArray[np.uint8], Mask]:
-    """Image (BGR) and mask (255 = object) of object `number` of a shape; the seed moves it and paints the background."""
+    """Image (BGR) and mask (255 = object) of object `number` of a shape, moved and before a background by the seed."""
     own, random = np.random.default_rng([number, 7]), np.random.default_rng([number, seed])
     colour, width, height = own.integers(0, 256, 3), own.uniform(0.8, 1.0), own.uniform(0.8, 1.0)
     canvas = np.zeros((2 * R, 2 * R), np.uint8)
@@ -128,6 +134,16 @@ def write_labelled(
     manifest = {"counts": {"views": len(rows)}, "shards": shards, "tables": tables, "settings": {}, "versions": {}}
     (folder / "dataset.json").write_text(json.dumps(manifest, indent=1))
     return folder
+
+
+def rewrite(folder: Path, change: Callable[[list[dict[str, Any]]], object]) -> None:
+    """Change rows of views.parquet, and its hash in dataset.json."""
+    rows = pq.read_table(folder / "views.parquet").to_pylist()
+    change(rows)
+    pq.write_table(pa.Table.from_pylist(rows), folder / "views.parquet")
+    manifest = json.loads((folder / "dataset.json").read_text())
+    manifest["tables"]["views.parquet"] = hashlib.sha256((folder / "views.parquet").read_bytes()).hexdigest()
+    (folder / "dataset.json").write_text(json.dumps(manifest))
 
 
 def damage(folder: Path, *keys: str) -> None:
