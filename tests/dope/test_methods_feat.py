@@ -1,8 +1,7 @@
-"""FEAT: attention over class means, its losses, its episodes, and where it starts from."""
+"""FEAT: what a step learns from, where it starts, how it is validated and how it classifies."""
 
 from __future__ import annotations
 
-import math
 import os
 import shutil
 import subprocess
@@ -16,10 +15,9 @@ import many_ranks_episodes
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
+from naive_attention import attention_of, naive_attention
 from tiny_labelled import UNSEEN, damage, rewrite, write_labelled
 
-from dope.augmentation import Share
 from dope.checkpoints import load_method
 from dope.common.errors import BadInput, UsageError
 from dope.config import TrainConfig, load_config
@@ -29,14 +27,12 @@ from dope.lowshot.evaluate import EvaluationConfig, evaluate
 from dope.methods import feat as feat_module
 from dope.methods import load_embedder, method_of
 from dope.methods.configs import FeatConfig
-from dope.methods.episode_order import EpisodeOrder, population
-from dope.methods.feat import Feat, FeatEmbedder, FeatNetwork, OnlineFeat, adapted_nearest
-from dope.methods.set_attention import Kept, SetAttention, centres, draw_kept, episode_losses
+from dope.methods.feat import Feat, FeatEmbedder, FeatNetwork, adapted_nearest
 from dope.order import Place
 from dope.run_logging import read_metrics
 from dope.state import learning_rate, new_state, set_learning_rate
 from dope.trainer import train
-from dope.view_index import ViewIndex, read_view_index
+from dope.view_index import read_view_index
 
 ALONE = Ranks(0, 1, torch.device("cpu"))
 CPU = torch.device("cpu")
@@ -45,7 +41,6 @@ TINY = [
     "schedule.epochs=2", "validation.every=1", "checkpoint.every=0", "log.every=1", "device=cpu",
 ]  # fmt: skip
 NAMES = ("bar", "disc", "ring", "square")
-Vector = NDArray[np.float64]
 
 
 def tiny(*overrides: str) -> TrainConfig:
@@ -65,230 +60,6 @@ def copy(shards: Path, tmp_path: Path) -> Path:
 @pytest.fixture(autouse=True)
 def one_thread() -> None:
     torch.set_num_threads(1)
-
-
-# -- attention and losses
-
-
-def attention_of(dim: int, seed: int = 0) -> SetAttention:
-    torch.manual_seed(seed)
-    attention = SetAttention(dim).double()
-    torch.nn.init.normal_(attention.norm.weight)
-    torch.nn.init.normal_(attention.norm.bias)
-    return attention
-
-
-def naive_attention(attention: SetAttention, members: Vector, kept: tuple[Vector, Vector] | None = None) -> Vector:
-    """Member by member."""
-    w = {name: parameter.detach().numpy() for name, parameter in attention.named_parameters()}
-    n, dim = members.shape
-    adapted = np.empty_like(members)
-    for i in range(n):
-        scores = []
-        for j in range(n):
-            q, k = w["query.weight"] @ members[i], w["key.weight"] @ members[j]
-            scores.append(sum(a * b for a, b in zip(q, k, strict=True)) / math.sqrt(dim))
-        weights = [math.exp(score) / sum(map(math.exp, scores)) for score in scores]
-        if kept is not None:
-            weights = [weight * kept[0][i, j] for j, weight in enumerate(weights)]
-        value = sum(weight * (w["value.weight"] @ members[j]) for j, weight in enumerate(weights))
-        output = w["output.weight"] @ value + w["output.bias"]
-        if kept is not None:
-            output = output * kept[1][i]
-        x = output + members[i]
-        spread = math.sqrt(sum((x - x.mean()) ** 2) / dim + 1e-5)
-        adapted[i] = (x - x.mean()) / spread * w["norm.weight"] + w["norm.bias"]
-    return adapted
-
-
-@pytest.mark.parametrize("dropping", [False, True])
-def test_attention_is_the_naive_loop(dropping: bool) -> None:
-    attention, sets = attention_of(6), torch.randn(2, 4, 6, dtype=torch.float64)
-    kept = draw_kept([(2, 4)], 6, (0.3, 0.5), 1, CPU, Share())[0]
-    found = attention(sets, Kept(kept.weights.double(), kept.outputs.double()) if dropping else None)
-    for e in range(2):
-        factors = (kept.weights[e].double().numpy(), kept.outputs[e].double().numpy()) if dropping else None
-        assert np.abs(found[e].detach().numpy() - naive_attention(attention, sets[e].numpy(), factors)).max() < 1e-10
-
-
-def test_attention_has_no_order_and_keeps_sets_apart() -> None:
-    attention, sets = attention_of(8), torch.randn(3, 5, 8, dtype=torch.float64)
-    found, order = attention(sets), torch.tensor([3, 0, 4, 1, 2])
-    assert torch.allclose(attention(sets[:, order]), found[:, order], atol=1e-12)
-    assert torch.allclose(attention(sets[1:2]), found[1:2], atol=1e-12)
-    other = sets.clone()
-    other[0, 2] += 1
-    assert not torch.allclose(attention(other)[0, 0], found[0, 0])  # members do see each other
-
-
-def test_attention_starts_as_the_paper_says() -> None:
-    torch.manual_seed(0)
-    attention = SetAttention(256)
-    names = dict(attention.named_parameters())
-    for part in ("query", "key", "value"):
-        assert f"{part}.bias" not in names
-        assert float(names[f"{part}.weight"].detach().std()) == pytest.approx(math.sqrt(2 / 512), rel=0.02)
-    assert names["output.bias"].shape == (256,) and "norm.weight" in names
-
-
-def test_losses_are_the_naive_loops() -> None:
-    random = np.random.default_rng(3)
-    attention = attention_of(4)
-    embeddings = random.normal(0, 2, (2, 3, 2 + 3, 4))  # two episodes, 3-way 2-shot, three queries
-    tensor = torch.from_numpy(embeddings)
-    adapted, middles = attention(tensor[:, :, :2].mean(2)), centres(attention, tensor)
-    found = [part.tolist() for part in episode_losses(tensor, adapted, middles, 2, (3.0, 5.0))]
-    for e in range(2):
-        shots = np.array([embeddings[e, way, :2].sum(0) / 2 for way in range(3)])
-        prototypes = naive_attention(attention, shots)
-        centre = [naive_attention(attention, embeddings[e, way]).sum(0) / 5 for way in range(3)]
-
-        def cross_entropy(x: Vector, points: Any, way: int, temperature: float) -> float:
-            logits = [-sum((point - x) ** 2) / temperature for point in points]
-            return math.log(sum(map(math.exp, logits))) - logits[way]
-
-        queries = [(embeddings[e, way, 2 + i], way) for way in range(3) for i in range(3)]
-        members = [(embeddings[e, way, i], way) for way in range(3) for i in range(5)]
-        hits = [int(np.argmin([sum((p - x) ** 2) for p in prototypes])) == way for x, way in queries]
-        assert found[0][e] == pytest.approx(np.mean([cross_entropy(x, prototypes, w, 3.0) for x, w in queries]))
-        assert found[1][e] == pytest.approx(np.mean([cross_entropy(x, centre, w, 5.0) for x, w in members]))
-        assert found[2][e] == pytest.approx(np.mean(hits))
-
-
-def test_dropout_is_a_function_of_the_seed_and_of_the_episodes_place() -> None:
-    shapes = [(4, 5), (4, 5, 16)]
-    whole = draw_kept(shapes, 12, (0.1, 0.5), 7, CPU, Share())
-    again = draw_kept(shapes, 12, (0.1, 0.5), 7, CPU, Share())
-    other = draw_kept(shapes, 12, (0.1, 0.5), 8, CPU, Share())
-    halves = [draw_kept([(2, *shape[1:]) for shape in shapes], 12, (0.1, 0.5), 7, CPU, Share(r, 2)) for r in range(2)]
-    for i, (width, shape) in enumerate(zip((5, 16), shapes, strict=True)):
-        assert whole[i].weights.shape == (*shape, width) and whole[i].outputs.shape == (*shape, 12)
-        for name in ("weights", "outputs"):
-            ours = getattr(whole[i], name)
-            assert torch.equal(ours, getattr(again[i], name)) and not torch.equal(ours, getattr(other[i], name))
-            assert torch.equal(ours, torch.cat([getattr(half[i], name) for half in halves]))
-    assert set(whole[1].outputs.unique().tolist()) == {0.0, 2.0}
-    assert float((whole[1].outputs == 0).float().mean()) == pytest.approx(0.5, abs=0.05)
-    assert float((whole[1].weights == 0).float().mean()) == pytest.approx(0.1, abs=0.02)
-    nothing = draw_kept(shapes, 12, (0.0, 0.0), 7, CPU, Share())
-    assert all(bool((part == 1).all()) for kept in nothing for part in (kept.weights, kept.outputs))
-
-
-def test_there_is_dropout_in_training_only() -> None:
-    online = OnlineFeat(FeatNetwork(0.125), FeatConfig(ways=2, queries=1), compiled=False).eval()
-    images = torch.rand(4, 3, 32, 32)
-    plain = online(images, 1, Share())
-    assert all(torch.equal(a, b) for a, b in zip(plain, online(images, 2, Share()), strict=True))
-    assert plain[0].shape == (1, 2, 2, 64) and plain[1].shape == plain[2].shape == (1, 2, 64)
-    assert torch.equal(plain[0].flatten(0, 2), online.network(images))  # class by class, the shots first
-    assert torch.equal(plain[1], online.network.attention(plain[0][:, :, :1].mean(2)))
-    online.train()
-    online.network.encoder.eval()
-    for i in (1, 2):
-        assert not torch.allclose(online(images, 1, Share())[i], plain[i])
-        assert not torch.allclose(online(images, 1, Share())[i], online(images, 2, Share())[i])
-
-
-# -- episodes
-
-
-def an_index(objects: dict[str, int], views: int = 2) -> ViewIndex:
-    """Classes with so many objects each."""
-    names = sorted(objects)
-    rows = [(c, o) for c, name in enumerate(names) for o in range(objects[name]) for _ in range(views)]
-    labels = np.array([c for c, _ in rows])
-    numbers = np.array([100 * c + o for c, o in rows])
-    order = np.random.default_rng(0).permutation(len(rows))
-    nothing = np.array([""] * len(rows))
-    zeros = np.zeros(len(rows), np.int64)
-    return ViewIndex(
-        None, nothing, nothing, nothing, zeros, zeros, labels[order], tuple(names), numbers[order], ""  # type: ignore[arg-type]
-    )  # fmt: skip
-
-
-PLENTY = an_index({"a": 7, "b": 6, "c": 9, "d": 6, "e": 5})
-SMALL = FeatConfig(ways=3, shots=2, queries=3, episodes=12)
-
-
-def test_an_episode_holds_distinct_classes_and_distinct_objects_of_them() -> None:
-    order = EpisodeOrder(PLENTY, 4, SMALL, seed=1)
-    assert (order.steps_per_epoch, order.n_objects, order.left_out) == (3, 33, ())
-    episodes = order.epoch(0)
-    assert episodes.shape == (3, 4, 3, 5)
-    for episode in episodes.reshape(-1, 3, 5):
-        labels = PLENTY.labels[episode]
-        assert (labels == labels[:, :1]).all() and len(set(labels[:, 0].tolist())) == 3
-        assert len(set(PLENTY.objects[episode].ravel().tolist())) == 15
-    assert set(PLENTY.labels[episodes].ravel().tolist()) == set(range(5))
-    assert len(set(episodes.ravel().tolist())) > 33  # not always the same view of an object
-
-
-def test_episodes_are_a_function_of_the_seed_and_of_the_epoch() -> None:
-    order = EpisodeOrder(PLENTY, 4, SMALL, seed=1)
-    assert np.array_equal(order.epoch(2), EpisodeOrder(PLENTY, 4, SMALL, seed=1).epoch(2))
-    assert not np.array_equal(order.epoch(2), order.epoch(3))
-    assert not np.array_equal(order.epoch(2), EpisodeOrder(PLENTY, 4, SMALL, seed=2).epoch(2))
-    # how many episodes make up a step decides nothing else
-    assert np.array_equal(
-        order.epoch(2).reshape(12, 3, 5), EpisodeOrder(PLENTY, 2, SMALL, seed=1).epoch(2).reshape(12, 3, 5)
-    )
-
-
-def test_episodes_go_on_at_any_step() -> None:
-    order = EpisodeOrder(PLENTY, 4, SMALL, seed=1)
-    whole = list(order.batches(Place(), 3))
-    assert len(whole) == 9 and all(len(rows) == 4 * 15 for rows in whole)
-    place = Place()
-    for step in range(9):
-        assert list(order.batches(place, 3)) == whole[step:]
-        place = order.after(place)
-    assert place == Place(3, 0)
-
-
-@pytest.mark.parametrize("world", [2, 4])
-def test_ranks_have_whole_episodes_that_make_up_the_step(world: int) -> None:
-    order = EpisodeOrder(PLENTY, 4, SMALL, seed=1)
-    shares = [list(order.batches(Place(1, 4), 2, rank=rank, world=world)) for rank in range(world)]
-    for step, whole in enumerate(order.batches(Place(1, 4), 2)):
-        assert [row for share in shares for row in share[step]] == whole
-        assert all(len(share[step]) == 4 // world * 15 for share in shares)
-
-
-def test_classes_with_too_few_objects_take_no_part(caplog: pytest.LogCaptureFixture) -> None:
-    index = an_index({"a": 7, "b": 4, "c": 5, "d": 6, "e": 1})
-    order = EpisodeOrder(index, 1, SMALL, seed=0)
-    assert order.left_out == ("b", "e") and order.n_objects == 18
-    assert set(index.labels[order.epoch(0)].ravel().tolist()) == {0, 2, 3}
-    assert "fewer than 5 objects take no part in episodes: b, e" in caplog.text
-
-
-@pytest.mark.parametrize(
-    ("objects", "batch_size", "world", "message"),
-    [
-        ({"a": 5, "b": 5, "c": 4}, 1, 1, "3 classes with 5 objects each .* 2 of 3 .*--set feat.queries=2 or less"),
-        ({"a": 5, "b": 5, "c": 2}, 1, 1, "--set feat.ways=2 or less"),
-        ({"a": 9, "b": 1}, 1, 1, "Give shards with more classes"),
-        ({"a": 5, "b": 5, "c": 5}, 13, 1, "12 episodes an epoch are less than one step of 13"),
-        ({"a": 5, "b": 5, "c": 5}, 3, 2, "3 episodes a step cannot be divided among 2 ranks.*batch_size=2"),
-    ],
-)
-def test_what_cannot_be_drawn_is_said_with_what_could(
-    objects: dict[str, int], batch_size: int, world: int, message: str
-) -> None:
-    with pytest.raises(UsageError, match=message):
-        EpisodeOrder(an_index(objects), batch_size, SMALL, seed=0).batches(Place(), 1, world=world)
-
-
-def test_the_population_does_not_depend_on_the_order_of_rows() -> None:
-    found = population(PLENTY.labels, PLENTY.objects, PLENTY.classes)
-    assert list(found) == ["a", "b", "c", "d", "e"] and [len(objects) for objects in found.values()] == [7, 6, 9, 6, 5]
-    for name, objects in found.items():
-        for number, rows in objects.items():
-            assert {PLENTY.classes[label] for label in PLENTY.labels[rows]} == {name}
-            assert PLENTY.objects[rows].tolist() == [int(number)] * 2
-
-
-# -- training
 
 
 def step_of(config: TrainConfig, batch: Any) -> tuple[dict[str, float], list[torch.Tensor | None]]:
@@ -434,9 +205,6 @@ def test_held_out_views_that_make_no_episode_are_no_error(copy: Path, tmp_path: 
     rewrite(copy, lambda rows: [r.update(split="train") for r in rows if not r["sequence"].startswith("bar")])
     result = train(copy, tmp_path / "run", tiny(), stop_after=1)
     assert result["score"] is None
-
-
-# -- evaluation
 
 
 def test_episodes_are_classified_by_the_adapted_means(monkeypatch: pytest.MonkeyPatch) -> None:
