@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from dope import __version__
-from dope.commands import evaluate, figure, train
+from dope.commands import evaluate, figure, results, study, train
 from dope.common.errors import DopeError, UsageError
 from pipeline.commands import app as prep
 
@@ -32,6 +32,8 @@ app = typer.Typer(
 
       dope eval run shards                                low-shot accuracy
 
+      dope results run other_run                          the paper's table of several runs
+
       dope figure run shards                              same parts, same colours
 
     [bold]dope demo[/] does all of it, in minutes, on objects that it makes itself.
@@ -41,6 +43,8 @@ app = typer.Typer(
 app.add_typer(prep, name="prep")
 app.command("train")(train)
 app.command("eval")(evaluate)
+app.command("results")(results)
+app.command("study")(study)
 app.command("figure")(figure)
 
 

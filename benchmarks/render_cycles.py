@@ -27,9 +27,9 @@ from pipeline.geometry import Camera
 from pipeline.render.config import CyclesConfig
 from pipeline.render.cycles import process, renderer
 from pipeline.render.cycles.exchange import scene_message, shot_message
-from pipeline.render.cycles.exposure import expose
 from pipeline.render.cycles.folders import PrivateFolder
 from pipeline.render.cycles.renderer import CyclesRenderer
+from pipeline.render.exposure import expose, white_under
 from pipeline.render.scene import Ground, Light, Model, Part, Scene, Shot, Surface
 
 
@@ -98,8 +98,9 @@ def measure_cost(config: CyclesConfig, objects: int, views: int, size: int) -> N
     for number in range(objects):
         one = scene(number, views, size)
         deadline = time.monotonic() + 3600
+        exposure = expose(white_under(one.light, one.ground), one.ground, one.light.strength)
         bare.ask(
-            scene_message(one, expose(one.light, one.ground), config, limits.threads, folder.path / "scene.npz"),
+            scene_message(one, exposure, config, limits.threads, folder.path / "scene.npz"),
             deadline,
         )
         spent, spent_bare = 0.0, 0.0

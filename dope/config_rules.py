@@ -17,8 +17,11 @@ if TYPE_CHECKING:
 Rule = tuple[str, bool, str]
 """A setting's dotted key, whether its value is right, and what it must be."""
 
-PROBABILITIES = ("colour_p", "flip_p", "single_background_p", "geometry_p", "one_colour_p", "noise_p")
-RANGES = ("hue", "saturation", "brightness", "gamma", "contrast", "rotation_deg", "longest_side_px")
+PROBABILITIES = (
+    "colour_p", "jitter_p", "grey_p", "blur_p", "flip_p", "single_background_p", "geometry_p", "one_colour_p",
+    "noise_p",
+)  # fmt: skip
+RANGES = ("hue", "saturation", "brightness", "gamma", "contrast", "blur_px", "rotation_deg", "longest_side_px")
 
 
 def check(config: TrainConfig) -> None:
@@ -28,6 +31,7 @@ def check(config: TrainConfig) -> None:
         *_finite(values),
         *_rules(config),
         *_augmentation_rules(config.augmentation),
+        *_contrast_rules(config),
         *_feat_rules(config),
     ):
         if not ok:
@@ -119,6 +123,10 @@ def _augmentation_rules(config: AugmentationConfig) -> Iterator[Rule]:
         yield f"augmentation.{name}", low <= high, "must be the least value, then the greatest"
     for name in ("saturation", "brightness", "contrast"):
         yield f"augmentation.{name}", getattr(config, name)[0] >= 0, "must not be negative"
+    *factors, hue = config.jitter
+    yield "augmentation.jitter", min(config.jitter) >= 0, "must not be negative"
+    yield "augmentation.jitter", max(factors) <= 1 and hue <= 0.5, "must be 1 or less, of the hue 0.5 or less"
+    yield "augmentation.blur_px", config.blur_px[0] > 0, "must be positive"
     room = NOMINAL_PX - config.longest_side_px[1]
     yield "augmentation.gamma", config.gamma[0] > 0, "must be positive"
     yield "augmentation.noise", 0 <= config.noise <= 256, "must lie in [0, 256]"
@@ -128,6 +136,20 @@ def _augmentation_rules(config: AugmentationConfig) -> Iterator[Rule]:
     margin = 0 <= config.margin_px <= room / 2
     yield "augmentation.margin_px", margin, f"must be 0 or more and leave augmentation.longest_side_px of {NOMINAL_PX}"
     yield "augmentation.largest_scale", config.largest_scale > 0, "must be positive"
+
+
+def _contrast_rules(config: TrainConfig) -> Iterator[Rule]:
+    """Of the methods that contrast whole views."""
+    supmoco, moco, vispe, simsiam = config.supmoco, config.moco, config.vispe, config.simsiam
+    for name in ("keys", "queue", "head"):
+        yield f"supmoco.{name}", getattr(supmoco, name) >= 1, "must be at least 1"
+    yield "moco.queue", moco.queue >= 1, "must be at least 1"
+    yield "moco.head", min(moco.head) >= 1, "must be two widths of at least 1"
+    for section, temperature in (("supmoco", supmoco), ("moco", moco), ("vispe", vispe)):
+        yield f"{section}.temperature", temperature.temperature > 0, "must be positive"
+    yield "vispe.alpha", vispe.alpha >= 0, "must not be negative"
+    for name in ("projector", "predictor"):
+        yield f"simsiam.{name}", getattr(simsiam, name) >= 1, "must be at least 1"
 
 
 def _feat_rules(config: TrainConfig) -> Iterator[Rule]:

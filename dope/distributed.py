@@ -13,6 +13,7 @@ from typing import Any
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 from torch.distributed.rendezvous import rendezvous
 
 from dope.common.errors import UsageError
@@ -48,6 +49,17 @@ class Ranks:
         dist.all_gather(parts, raw)
         return torch.cat(parts).view(tensor.dtype)
 
+    def gather_with_gradient(self, tensor: Tensor) -> Tensor:
+        """As `gather`, and gradients flow back: each rank's part gets the sum of those of all ranks' losses.
+
+        With DistributedDataParallel, which averages gradients over ranks, the weights get the gradient of the mean of
+        the ranks' losses.
+        """
+        if self.world == 1:
+            return tensor
+        gathered: Tensor = _Gather.apply(tensor, self)
+        return gathered
+
     def sum(self, tensor: Tensor) -> Tensor:
         """Sum over ranks, a new tensor; no gradient."""
         tensor = tensor.detach().clone()
@@ -76,6 +88,20 @@ class Ranks:
         """Return when all ranks are here."""
         if self.world > 1:
             dist.barrier()
+
+
+class _Gather(torch.autograd.Function):
+    """`Ranks.gather`, differentiable."""
+
+    @staticmethod
+    def forward(ctx: Any, tensor: Tensor, ranks: Ranks) -> Tensor:
+        ctx.ranks = ranks
+        return ranks.gather(tensor)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        return ctx.ranks.share(ctx.ranks.sum(gradient.contiguous())), None
 
 
 @contextmanager

@@ -28,6 +28,7 @@ from dope.common.errors import BadInput, DopeError
 
 Notify = Callable[[str], None]
 """Called by the work with a few words on what it does now."""
+SMALLER = "use fewer or smaller pictures (videos: --count, --long-side; renders: --size)"
 
 
 @dataclass(frozen=True)
@@ -128,8 +129,7 @@ class Child:
             if self._pipe not in ready:
                 raise ChildFailed(
                     f"took longer than {self._limits.minutes:g} minutes and was stopped",
-                    remedy="Raise --minutes and add --retry-failed, or use fewer or smaller frames (--count, "
-                    "--long-side)",
+                    remedy=f"Raise --minutes and add --retry-failed, or {SMALLER}",
                 )
             try:
                 kind, value = self._pipe.recv()
@@ -193,7 +193,7 @@ def _cause_of_death(exitcode: int | None, limits: Limits, log: Path) -> str:
         name = signal.Signals(-exitcode).name
         if name == "SIGKILL":
             said += f" (often a lack of memory; its own limit is {limits.memory_gib:g} GiB, --memory-gib)"
-            said += ". Use fewer --workers or smaller frames, and add --retry-failed"
+            said += ". Use fewer --workers or smaller pictures, and add --retry-failed"
         return f"the process was ended by {name}{said}"
     return f"the process ended with exit code {exitcode}{said}"
 
@@ -260,7 +260,7 @@ def _die_with_parent() -> None:
 def _out_of_memory(limits: Limits) -> ChildFailed:
     return ChildFailed(
         f"needed more than {limits.memory_gib:g} GiB of memory",
-        remedy="Raise --memory-gib and add --retry-failed, or use fewer or smaller frames (--count, --long-side)",
+        remedy=f"Raise --memory-gib and add --retry-failed, or {SMALLER}",
     )
 
 

@@ -22,6 +22,16 @@ class AugmentationConfig:
     """Exponent of all channels."""
     contrast: tuple[float, float] = (0.6, 1.6)
     """Factor on the distance from the image's mean grey value."""
+    jitter_p: float = 0.0
+    """Probability of colour jitter as a whole: brightness, contrast, saturation and hue in a random order."""
+    jitter: tuple[float, float, float, float] = (0.4, 0.4, 0.4, 0.1)
+    """How far the jitter goes: the first three's factors lie in 1 -+ this, the hue's shift in -+ this (in turns)."""
+    grey_p: float = 0.0
+    """Probability that a view loses its colour."""
+    blur_p: float = 0.0
+    """Probability of a Gaussian blur."""
+    blur_px: tuple[float, float] = (0.1, 2.0)
+    """Standard deviation of the blur."""
     flip_p: float = 0.5
     """Probability of a horizontal flip, for each view."""
     background_removal: Literal["paired", "off"] = "paired"

@@ -19,6 +19,7 @@ from torch import Tensor
 from dope.augmentation.background import BackgroundPlan, corners
 from dope.augmentation.colour import GREY
 from dope.augmentation.geometry import halvings
+from dope.augmentation.jitter import OPERATIONS, JitterPlan
 
 if TYPE_CHECKING:
     from dope.augmentation.views import ViewPlan
@@ -51,11 +52,15 @@ def change_views(images: Sequence[Tensor], masks: Tensor, plan: ViewPlan) -> tup
             image = cv2.flip(image, 1)
         out, mask = new_images[i], new_masks[i]
         if not removes[i]:
-            out[...] = coloured(image, chosen[i], amounts[i])
+            out[...] = jittered(coloured(image, chosen[i], amounts[i]), plan.jitter, i)
             continue
         backgrounds.paint(i, out)
         left, top, right, bottom = _even(boxes[i], 2 ** levels[i])
-        pixels = coloured(image, chosen[i], amounts[i], (slice(top, bottom), slice(left, right)))
+        window = (slice(top, bottom), slice(left, right))
+        if plan.jitter is None:
+            pixels = coloured(image, chosen[i], amounts[i], window)
+        else:  # its mean and its blur are the whole view's
+            pixels = np.ascontiguousarray(jittered(coloured(image, chosen[i], amounts[i]), plan.jitter, i)[window])
         if moves[i]:
             old = mask[top:bottom, left:right].copy()
             mask[...] = False
@@ -94,6 +99,25 @@ def coloured(
         blend = np.column_stack([contrast * np.eye(3), [(1 - contrast) * mean] * 3])
         pixels = _clamped(cv2.transform(pixels[window], blend), contrast)
     return np.ascontiguousarray(pixels)
+
+
+def jittered(pixels: Pixels, plan: JitterPlan | None, i: int) -> Pixels:
+    """`jitter.change_colours` of view `i`."""
+    if plan is None:
+        return pixels
+    if plan.chosen[i]:
+        amounts = dict(zip(OPERATIONS, plan.amounts[i].tolist(), strict=True))
+        for number in plan.order[i].tolist():
+            name = OPERATIONS[number]
+            # one change at a time: hue, saturation, brightness, gamma, contrast is the order of `coloured`
+            alone = [name == other for other in ("hue", "saturation", "brightness", "gamma", "contrast")]
+            pixels = coloured(pixels, alone, [amounts[name]] * 5)
+    if plan.grey[i]:
+        pixels = cv2.transform(pixels, np.tile(np.array(GREY), (3, 1)))
+    if plan.blurred[i]:
+        kernel = plan.kernels[i].numpy(force=True)
+        pixels = cv2.sepFilter2D(pixels, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT_101)
+    return pixels
 
 
 def _changed(values: Pixels, brightness: float | None, gamma: float | None) -> Pixels:

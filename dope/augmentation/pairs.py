@@ -10,7 +10,7 @@ from torch import Tensor
 from dope.augmentation.config import AugmentationConfig
 from dope.augmentation.draws import WHOLE, Draws, Share, uniform_rows
 from dope.augmentation.geometry import transform_points
-from dope.augmentation.views import COLUMNS, augment_views, to_float
+from dope.augmentation.views import augment_views, columns, to_float
 from dope.batch import PairBatch
 
 
@@ -32,7 +32,7 @@ def augment(
         share: which part of the global batch this is, where other ranks hold the others; with generators in the same
             state on all ranks, each gets what one process with the whole batch would make of its part.
     """
-    uniform = uniform_rows(len(batch), 1 + 2 * COLUMNS, generator, batch.points.device, share)
+    uniform = uniform_rows(len(batch), 1 + 2 * columns(config), generator, batch.points.device, share)
     option = (uniform[:, 0] * 4).long()
     remove = torch.cat([option != 1, option != 0]) & (config.background_removal == "paired")
     images, masks, matrices = augment_views(

@@ -8,11 +8,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dope.augmentation import background, colour, geometry, on_cpu
+from dope.augmentation import background, colour, geometry, jitter, on_cpu
 from dope.augmentation.config import AugmentationConfig
 from dope.augmentation.draws import WHOLE, Draws, Share, rows_where, uniform_rows
 
 COLUMNS = 1 + colour.COLUMNS + geometry.COLUMNS + background.COLUMNS
+
+
+def columns(config: AugmentationConfig) -> int:
+    """How many numbers are drawn for a view; what is off takes none, so that it changes nothing of the others."""
+    return COLUMNS + (jitter.COLUMNS if jitter.is_on(config) else 0)
 
 
 @dataclass(frozen=True)
@@ -22,6 +27,7 @@ class ViewPlan:
     Attributes:
         flip: (n,) bool, mirrored first.
         colours: changes of the whole view's colours.
+        jitter: further ones after these, or None.
         remove: (n,) bool, whether the background is replaced by `backgrounds`, with windows of the field `noise`.
         boxes: (n, 4) left, top, right and bottom edges of the mirrored objects.
         moved: (n,) bool, whether the mirrored object is moved by `moves` (n, 3, 3) with `scales` (n,).
@@ -36,6 +42,7 @@ class ViewPlan:
     moved: Tensor
     moves: Tensor
     scales: Tensor
+    jitter: jitter.JitterPlan | None = None
 
 
 @torch.no_grad()
@@ -54,7 +61,7 @@ def augment_images(
     Returns:
         images (B, 3, H, W) float32 in [0, 1] and masks (B, 1, H, W) bool.
     """
-    draws = Draws(uniform_rows(len(images), 1 + COLUMNS, generator, images.device, share))
+    draws = Draws(uniform_rows(len(images), 1 + columns(config), generator, images.device, share))
     remove = draws.chance(config.single_background_p) & (config.background_removal != "off")
     new_images, new_masks, _ = augment_views([images], masks, remove, config, draws, generator)
     return new_images, new_masks
@@ -74,7 +81,7 @@ def augment_views(
     Args:
         images: (b, 3, H, W) each, of n views in all.
         masks: (n, 1, H, W) bool.
-        draws: holds `COLUMNS` numbers a view; all that is drawn for a view comes from them.
+        draws: holds `columns(config)` numbers a view; all that is drawn for a view comes from them.
         generator: of the noise that all views share.
 
     Returns:
@@ -93,7 +100,9 @@ def augment_views(
     boxes, present = geometry.bounding_boxes(masks)
     remove = remove & present
     moves, moved, scales = geometry.draw_moves(draws, masks, boxes, remove & config.geometry, config)
-    plan = ViewPlan(flip, colours, remove, backgrounds, noise, boxes, moved, moves, scales)
+    unit = min(height, width) / geometry.NOMINAL_PX
+    jitters = jitter.draw_jitter(draws, config, unit) if jitter.is_on(config) else None
+    plan = ViewPlan(flip, colours, remove, backgrounds, noise, boxes, moved, moves, scales, jitters)
     make = on_cpu.change_views if masks.device.type == "cpu" else change_views
     with torch.autocast(masks.device.type, enabled=False):
         new_images, new_masks = make(images, masks, plan)
@@ -113,6 +122,8 @@ def change_views(images: Sequence[Tensor], masks: Tensor, plan: ViewPlan) -> tup
     height, width = masks.shape[-2:]
     result, masks = to_float(mirrored(torch.cat(tuple(images)), plan.flip)), masks.clone()
     colour.change_colours(result, plan.colours)
+    if plan.jitter is not None:
+        jitter.change_colours(result, plan.jitter)
     moving = rows_where(plan.moved)
     if moving is not None:
         result[moving], masks[moving] = geometry.warp(

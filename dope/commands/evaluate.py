@@ -8,18 +8,27 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dope.commands.options import Device, Run, Shards, device_name
+from dope.commands.options import Device, check_choice, device_name
+from dope.commands.places import run_and_shards
 from dope.common.errors import UsageError
 
 if TYPE_CHECKING:
+    from dope.encoders.embedder import MaskChoice
     from dope.lowshot.splits import SplitTable
 
 
 def evaluate(
-    run: Run,
-    shards: Shards,
+    places: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="[RUN] SHARDS",
+            help="A run (its newest checkpoint) or a checkpoint; and the folder that `dope prep shards --out` wrote, "
+            "or a URL of it: s3://, gs://, hf://. With --encoder, SHARDS alone.",
+            show_default=False,
+        ),
+    ],
     out: Annotated[
-        Path | None, typer.Option("--out", help="Folder for results.parquet.  [default: RUN/eval]", show_default=False)
+        Path | None, typer.Option("--out", help="Folder for results.parquet.", show_default="RUN/eval, or eval/ENCODER")
     ] = None,
     ways: Annotated[list[int] | None, typer.Option(help="Classes an episode; repeatable.  [default: 5]")] = None,
     shots: Annotated[list[int] | None, typer.Option(help="Labelled views a class; repeatable.  [default: 1]")] = None,
@@ -96,6 +105,22 @@ def evaluate(
             show_default=False,
         ),
     ] = None,
+    encoder: Annotated[
+        str | None,
+        typer.Option(
+            "--encoder",
+            help="Instead of a run: any function of images as module:function or FILE.py:function, or a Hugging Face "
+            "model in a folder as hf:FOLDER (docs/encoders.md).",
+            show_default=False,
+        ),
+    ] = None,
+    encoder_mask: Annotated[
+        str,
+        typer.Option(
+            "--encoder-mask",
+            help="none: the encoder's own masks, if any. given: those of the shards, an oracle that no encoder has.",
+        ),
+    ] = "none",
     device: Device = "auto",
 ) -> None:
     """Low-shot recognition: accuracy over random episodes with its 95% confidence interval, beside chance.
@@ -114,9 +139,18 @@ def evaluate(
       dope eval run shards --table modelnet40_ls --select --ways 5 --ways 10 --shots 1 --shots 5
 
       dope eval run shards --split-file my_splits.json --table-split 0 --classifier logistic --support-copies 5
+
+    Features that were not trained here, under the same protocol (docs/encoders.md):
+
+      dope eval shards --encoder my_features:encode
+
+      dope eval shards --encoder hf:models/dinov2-small --encoder-mask given
     """
     from rich.console import Console
     from rich.markup import escape
+
+    run, shards = run_and_shards(places, encoder)
+    _check_encoder(encoder, encoder_mask, select=select, compare_untrained=compare_untrained)
 
     from dope.common import settings
     from dope.common.progress import progress_bar
@@ -146,17 +180,27 @@ def evaluate(
     keep_heap()
     with progress_bar() as progress:
         options: dict[str, Any] = {"device": device_name(device), "progress": progress}
-        if select:
+        if encoder is not None:
+            from dope.encoders.on_shards import default_folder, encoder_on_shards
+            from dope.lowshot.evaluate import evaluate_embedders
+
+            mask: MaskChoice = "given" if encoder_mask == "given" else "none"
+            subject = encoder_on_shards(encoder, shards, mask=mask, device=options["device"])
+            result = evaluate_embedders([subject], shards, config, table=splits, **options)
+            folder = out or default_folder(subject.embedder.name)
+        elif select:
             from dope.lowshot.selection import evaluate_best
 
-            assert splits is not None
+            assert splits is not None and run is not None
             result = evaluate_best(run, shards, config, splits, **options)
         else:
             from dope.checkpoints import find_checkpoint
             from dope.lowshot.evaluate import evaluate as run_evaluation
 
+            assert run is not None
             result = run_evaluation(find_checkpoint(run), shards, config, table=splits, **options)
-    folder = out or (run if run.is_dir() else run.parent.parent) / "eval"
+    if run is not None:
+        folder = out or (run if run.is_dir() else run.parent.parent) / "eval"
     append_rows(folder / "results.parquet", result.rows)
     append_rows(folder / "results.json", result.rows)
     console = Console(highlight=False)
@@ -168,6 +212,16 @@ def evaluate(
         f"match; rows in [bold]{escape(str(folder / 'results.parquet'))}[/]",
         soft_wrap=True,
     )
+
+
+def _check_encoder(encoder: str | None, mask: str, *, select: bool, compare_untrained: bool) -> None:
+    """Refuse what has no meaning with an encoder, or without one."""
+    check_choice(mask, "--encoder-mask", ("none", "given"))
+    if encoder is None and mask != "none":
+        raise UsageError("is for --encoder", where=f"--encoder-mask {mask}", remedy="Leave it out")
+    flags = {"--select": select, "--compare-untrained": compare_untrained}
+    for flag in (flag for flag, given in flags.items() if given and encoder is not None):
+        raise UsageError("is for runs, an encoder has no checkpoints", where=flag, remedy="Leave it out")
 
 
 def _splits(table: str | None, split_file: Path | None, select: bool) -> SplitTable | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -52,8 +53,9 @@ class SpillFile:
         self._end = 0
 
     @property
-    def nbytes(self) -> int:
-        return self._end
+    def free(self) -> int:
+        """Bytes that the disk has left."""
+        return shutil.disk_usage(self.folder).free
 
     def append(self, array: NDArray[Any]) -> Place:
         """Write an array; returns what `read` needs. Raises `DiskFull`."""

@@ -16,10 +16,11 @@ from dope.lowshot.cell_store import GIB, CellStore, SpillFile
 from dope.lowshot.embedding import Embedder
 from dope.lowshot.encoding import ViewCells
 from dope.lowshot.episodes import Episodes, Indices
-from dope.lowshot.matching import BestShots, query_cells, score_support
+from dope.lowshot.matching import BestShots, QueryDescriptors, query_cells
 from dope.lowshot.work import Work
 
-_TRIED = 32  # views written to disk before it is judged whether encoding them again would take less time
+_TRIED = 32  # views written to the disk between judgements whether that is still the thing to do
+_LEAVE_FREE = GIB  # bytes of the disk that are left to others
 
 
 def classify_locally(embedder: Embedder, episodes: Sequence[Episodes], work: Work) -> list[Indices]:
@@ -42,6 +43,7 @@ def classify_locally(embedder: Embedder, episodes: Sequence[Episodes], work: Wor
         queries = _QueryCells(work, query_views, spill)
         store = CellStore(None if work.spill == "never" else spill)
         again: list[int] = []
+        judged = 0
         started = time.perf_counter()
         with work.encoding():
             for i, (view, cells) in enumerate(work.cells(embedder, needed)):
@@ -49,11 +51,12 @@ def classify_locally(embedder: Embedder, episodes: Sequence[Episodes], work: Wor
                     queries.add(view, cells)
                 if is_support[i] and not store.put(view, cells, queries.room_left):
                     again.append(view)
-                if store.spilled == _TRIED and work.spill == "auto":
-                    encode_seconds = (time.perf_counter() - started - store.spill_seconds) / (i + 1)
-                    # written once and read once
-                    if 2 * store.spill_seconds / _TRIED > encode_seconds:
+                if work.spill == "auto" and store.spilled == judged + _TRIED:
+                    judged = store.spilled
+                    encoding = (time.perf_counter() - started - store.spill_seconds) / (i + 1)
+                    if reason := _why_not_spill(store.spill_seconds / judged, encoding, spill.free):
                         store.stop_spilling()
+                        work.notes.append(f"{reason}: views that --memory has no room for were encoded twice")
         done, total = 0, len(best.support_views)
         with work.matching_time():
             for view, cells in store.take_all():
@@ -68,6 +71,21 @@ def classify_locally(embedder: Embedder, episodes: Sequence[Episodes], work: Wor
     return best.predictions()
 
 
+def _why_not_spill(spill_seconds: float, encode_seconds: float, free: int) -> str:
+    """Why views should no longer wait on the disk, or nothing.
+
+    Args:
+        spill_seconds: wall time of writing a view to the disk.
+        encode_seconds: of encoding it again.
+        free: bytes that the disk has left.
+    """
+    if free < _LEAVE_FREE:
+        return "the disk of --cache is nearly full"
+    if 2 * spill_seconds > encode_seconds:  # written once and read once
+        return "the disk of --cache is slower than the network"
+    return ""
+
+
 class _QueryCells:
     """The k chosen cells of every query view: descriptors (Q, k, D) and norms (Q, k); on the disk where they take more
     than half of the memory."""
@@ -77,6 +95,7 @@ class _QueryCells:
         self._keys = work.views.columns["key"]
         self._norms = torch.empty(len(views), work.matching.points)
         self._descriptors: Tensor | None = None  # allocated with the first view, which tells D
+        self._ready: QueryDescriptors | None = None  # once all are added
         self._fallbacks = 0
         self.room_left = work.memory_gib * GIB
 
@@ -90,13 +109,13 @@ class _QueryCells:
         self._descriptors[row] = cells.at(chosen).to(self._descriptors.device)
         self._norms[row] = torch.from_numpy(norm_map.ravel()[chosen])
 
-    @torch.inference_mode()
     def score(self, view: int, cells: ViewCells, best: BestShots) -> None:
         """Score a support view against the query views that need it."""
-        assert self._descriptors is not None, "queries are added before anything is scored"
+        if self._ready is None:
+            assert self._descriptors is not None, "queries are added before anything is scored"
+            self._ready = QueryDescriptors(self._descriptors, self._norms)
         needing = best.queries_of(view)
-        rows = np.searchsorted(self._views, needing)
-        scores = score_support(self._descriptors, self._norms, cells, rows)
+        scores = self._ready.scores(cells, np.searchsorted(self._views, needing))
         if not np.isfinite(scores).all():  # of cells that were projected only now
             raise self._work.not_finite(view)
         best.add(view, needing, scores)

@@ -12,6 +12,7 @@ the search ends as soon as the best match found exceeds that bound. The maximum 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -22,8 +23,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dope.common.seeds import derive_seed
-from dope.farthest_points import farthest_points
 from dope.lowshot.episodes import Episodes, Indices
+from dope.lowshot.screening import Screen
 
 _LEVELS = (0.3, 0.05)  # norms at which the search for a better match may end: the object, its soft border, then all
 _ROUNDING = 1e-5  # a bound must be exceeded by this share, more than float32 dot products of unit vectors err
@@ -68,15 +69,42 @@ def query_cells(norms: NDArray[np.float32], key: str, config: MatchingConfig) ->
     if len(foreground) < config.points:
         rng = np.random.default_rng(seed)
         return rng.choice(norms.size, config.points, replace=norms.size < config.points).astype(np.int64)
-    cells = torch.from_numpy(np.stack(np.unravel_index(foreground, norms.shape), axis=1)).float()
-    valid = torch.ones(1, len(cells), dtype=torch.bool)
-    start = torch.rand(1, generator=torch.Generator().manual_seed(seed))
-    chosen, _ = farthest_points(cells[None], valid, config.points, start)
-    return foreground[chosen[0].numpy()]
+    start = float(torch.rand(1, generator=torch.Generator().manual_seed(seed)))
+    return _farthest_cells(norms >= config.foreground, foreground[int(start * len(foreground))], config.points)
 
 
-def best_similarities(queries: Tensor, query_norms: Tensor, support: SupportCells) -> Tensor:
-    """The greatest dot product (R,) of each query descriptor (R, D) with any cell of the support view."""
+def _farthest_cells(foreground: NDArray[np.bool_], first: int, n: int) -> NDArray[np.int64]:
+    """`n` cells of a foreground (h, w) that has as many, from `first` on each the farthest from those before.
+
+    Of equally far ones the first: as `dope.farthest_points`, but on a grid, where all distances from a cell are a part
+    of one table.
+    """
+    h, w = foreground.shape
+    table = _squared_distances(h, w)
+    nearest = np.where(foreground, np.int32(h * h + w * w), np.int32(-1))
+    chosen = np.empty(n, np.int64)
+    for i in range(n):
+        chosen[i] = first if i == 0 else int(nearest.argmax())
+        row, column = divmod(int(chosen[i]), w)
+        from_cell = table[h - 1 - row : 2 * h - 1 - row, w - 1 - column : 2 * w - 1 - column]
+        np.minimum(nearest, from_cell, out=nearest)
+    return chosen
+
+
+@functools.cache
+def _squared_distances(h: int, w: int) -> NDArray[np.int32]:
+    """(2h - 1, 2w - 1): squared distance of an offset, with no offset in the middle."""
+    rows, columns = np.arange(1 - h, h, dtype=np.int32), np.arange(1 - w, w, dtype=np.int32)
+    return rows[:, None] ** 2 + columns**2
+
+
+def best_similarities(
+    queries: Tensor, query_norms: Tensor, support: SupportCells, screening: tuple[Screen, Tensor] | None = None
+) -> Tensor:
+    """The greatest dot product (R,) of each query descriptor (R, D) with any cell of the support view.
+
+    `screening`: a subspace and the queries' coordinates in it, which make the search faster.
+    """
     best = queries.new_full((len(queries),), -torch.inf)
     rows: Tensor | None = None  # None: all
     start = 0
@@ -84,8 +112,10 @@ def best_similarities(queries: Tensor, query_norms: Tensor, support: SupportCell
     for end in (*ends, len(support.norms)):
         if end == start:
             continue
-        cells = support.descriptors(start, end).T
-        if rows is None:
+        cells = support.descriptors(start, end)
+        if rows is None and screening is not None:
+            best = screening[0].row_maxima(queries, query_norms, screening[1], cells)
+        elif rows is None:
             best = _row_maxima(queries, cells)
         else:
             best[rows] = torch.maximum(best[rows], _row_maxima(queries[rows], cells))
@@ -100,38 +130,55 @@ def best_similarities(queries: Tensor, query_norms: Tensor, support: SupportCell
 
 
 def _row_maxima(queries: Tensor, cells: Tensor) -> Tensor:
-    """max over M of queries (R, D) @ cells (D, M)."""
-    step = max(1, _SIMILARITIES // cells.shape[1]) if queries.device.type == "cpu" else len(queries)
-    if len(queries) <= step:
-        return (queries @ cells).amax(1)
-    best = queries.new_empty(len(queries))
-    buffer = queries.new_empty(step, cells.shape[1])
-    for start in range(0, len(queries), step):
-        part = queries[start : start + step]
-        torch.amax(torch.mm(part, cells, out=buffer[: len(part)]), 1, out=best[start : start + step])
-    return best
+    """max over M of queries (R, D) @ cells (M, D)^T."""
+    if queries.device.type != "cpu":
+        return (queries @ cells.T).amax(1)
+    # NumPy's matrix products are the faster ones on CPUs for which PyTorch's library was not made
+    rows, columns = queries.numpy(), cells.numpy().T
+    step = max(1, _SIMILARITIES // len(cells))
+    buffer = np.empty((min(step, len(rows)), len(cells)), np.float32)
+    best = np.empty(len(rows), np.float32)
+    for start in range(0, len(rows), step):
+        part = rows[start : start + step]
+        similarities = np.matmul(part, columns, out=buffer[: len(part)])
+        np.max(similarities, axis=1, out=best[start : start + step])
+    return torch.from_numpy(best)
 
 
-def score_support(
-    queries: Tensor, query_norms: Tensor, support: SupportCells, rows: NDArray[np.integer] | None = None
-) -> NDArray[np.float32]:
-    """Scores (Q,) of Q query views against one support view.
+class QueryDescriptors:
+    """The k chosen cells of Q query views, ready to be compared with support views.
 
     Args:
-        queries: (N, k, D) descriptors of the query views' cells, on the support's device or on the CPU.
-        query_norms: (N, k).
-        support: the support view.
-        rows: (Q,) which of the N query views; None: all.
+        descriptors: (Q, k, D), on the support views' device or on the CPU.
+        norms: (Q, k), on the CPU or there as well.
     """
-    chosen = np.arange(len(queries)) if rows is None else rows
-    scores = np.empty(len(chosen), np.float32)
-    device = support.descriptors(0, 1).device
-    for start in range(0, len(chosen), _QUERIES):
-        part = torch.from_numpy(chosen[start : start + _QUERIES]).to(queries.device)
-        descriptors, norms = queries[part].to(device), query_norms[part].to(device)
-        best = best_similarities(descriptors.flatten(0, 1), norms.flatten(), support)
-        scores[start : start + _QUERIES] = best.view(len(part), -1).sum(1).cpu().numpy()
-    return scores
+
+    def __init__(self, descriptors: Tensor, norms: Tensor) -> None:
+        self.descriptors, self.norms = descriptors, norms
+        # of views spread over all, so that nothing depends on their number but the subspace
+        some = descriptors[:: max(1, len(descriptors) // 512)].flatten(0, 1)
+        self._screen = Screen.of(some)
+        self._coordinates: Tensor | None = None
+        if self._screen is not None:
+            coordinates = [self._screen.coordinates(part.flatten(0, 1)) for part in descriptors.split(_QUERIES)]
+            self._coordinates = torch.cat(coordinates).view(*descriptors.shape[:2], -1)
+
+    @torch.inference_mode()
+    def scores(self, support: SupportCells, rows: NDArray[np.integer] | None = None) -> NDArray[np.float32]:
+        """Scores (R,) of the query views `rows` (R,) against one support view; None: of all."""
+        chosen = np.arange(len(self.descriptors)) if rows is None else rows
+        scores = np.empty(len(chosen), np.float32)
+        device = support.descriptors(0, 1).device
+        for start in range(0, len(chosen), _QUERIES):
+            part = torch.from_numpy(chosen[start : start + _QUERIES]).to(self.descriptors.device)
+            descriptors = self.descriptors[part].to(device).flatten(0, 1)
+            norms = self.norms[part.to(self.norms.device)].to(device).flatten()
+            screening = None
+            if self._screen is not None and self._coordinates is not None and device.type == "cpu":
+                screening = self._screen, self._coordinates[part].flatten(0, 1)
+            best = best_similarities(descriptors, norms, support, screening)
+            scores[start : start + _QUERIES] = best.view(len(part), -1).sum(1).cpu().numpy()
+        return scores
 
 
 class BestShots:

@@ -23,6 +23,10 @@ METHODS: dict[str, str] = {
     "simpleshot": "dope.methods.simpleshot:SimpleShot",
     "rfs": "dope.methods.rfs:Rfs",
     "feat": "dope.methods.feat:Feat",
+    "supmoco": "dope.methods.supmoco:SupMoCo",
+    "vispe": "dope.methods.vispe:Vispe",
+    "vispe_moco": "dope.methods.vispe_moco:VispeMoCo",
+    "vispe_simsiam": "dope.methods.vispe_simsiam:VispeSimSiam",
 }
 """Name -> where its class is; imported when it is asked for."""
 

@@ -109,10 +109,12 @@ def _do(piece: Piece, config: StudyConfig, out: Path, outcome: Outcome, say: Say
     if start is not None and (before in outcome.failed or not (out / "runs" / before / "checkpoints").is_dir()):
         return f"it starts from {before}, which is not there"
     piece.run.mkdir(parents=True, exist_ok=True)
-    for number, (what, command) in enumerate(commands(piece, config, out)):
+    anew = False
+    for what, command in commands(piece, config, out):
         mark = piece.run / f".{what}.json"
-        if mark.is_file() and files.read_json(mark) == list(command) and number == 0:
+        if not anew and mark.is_file() and files.read_json(mark) == list(command):
             continue
+        anew = True  # another network is evaluated again
         say(f"{piece.name}: {what}")
         began = time.perf_counter()
         why = _call(command, piece.run / "log.txt", config)

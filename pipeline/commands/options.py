@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -59,8 +60,8 @@ def run_options(
     from pipeline.engines import default_workers
     from pipeline.tasks import RunOptions
 
-    if minutes <= 0 or memory_gib <= 0:
-        raise UsageError("--minutes and --memory-gib must be positive")
+    if not (0 < minutes < math.inf and 0 < memory_gib < math.inf):
+        raise UsageError("--minutes and --memory-gib must be positive numbers")
     count = workers or max(1, default_workers() // threads)
     return RunOptions(count, Limits(minutes, memory_gib, threads), overwrite, retry_failed)
 

@@ -34,17 +34,22 @@ def render(
         ),
     ] = None,
     recipe: Annotated[
-        str,
+        str | None,
         typer.Option(
             help="modelnet, shapenet, abc: the paper's scenes for them; plain: the object alone, in a studio's light; "
             "procedural: objects that are made on the spot.",
+            show_default="plain",
             rich_help_panel=SCENES,
         ),
-    ] = "plain",
+    ] = None,
     renderer: Annotated[
-        str,
-        typer.Option(help="fast: a rasteriser; cycles: Blender's path tracer (bpy).", rich_help_panel=QUALITY),
-    ] = "fast",
+        str | None,
+        typer.Option(
+            help="fast: a rasteriser; cycles: Blender's path tracer (bpy).",
+            show_default="fast",
+            rich_help_panel=QUALITY,
+        ),
+    ] = None,
     count: Annotated[
         int | None,
         typer.Option(min=1, help="How many objects; --recipe procedural.", show_default=False, rich_help_panel=OBJECTS),
@@ -194,6 +199,11 @@ def render(
     if resolved.recipe == "procedural":
         if meshes or count is None:
             raise UsageError("--recipe procedural makes its objects itself", remedy="Give --count N, and no MESHES")
+        of_meshes = {"--category": category, "--limit": limit}
+        of_meshes["--category-from"] = None if category_from == "auto" else category_from
+        if given := [flag for flag, value in of_meshes.items() if value is not None]:
+            what = f"{', '.join(given)}: of meshes only; procedural objects have no category"
+            raise UsageError(what, remedy="Leave it out; --count says how many objects")
         sources = [ProceduralSource(number, resolved.seed) for number in range(count)]
     else:
         if not meshes or count is not None:

@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 from dope.common import settings
+from dope.common.errors import UsageError
 
 Recipe = Literal["modelnet", "shapenet", "abc", "plain", "procedural"]
+
+
+def _require_between(config: Any, **limits: tuple[float, float]) -> None:
+    """Refuse numbers, and pairs of them, that do not lie between their limits, or whose first is the greater."""
+    for name, (low, high) in limits.items():
+        value = getattr(config, name)
+        ends = value if isinstance(value, tuple) else (value, value)
+        if not low <= ends[0] <= ends[1] <= high:  # neither if one is no number
+            order = ", the lesser first" if isinstance(value, tuple) else ""
+            raise UsageError(f"{name} must be between {low:g} and {high:g}{order}, not {value}", where="settings")
 
 
 @dataclass(frozen=True)
@@ -32,7 +43,9 @@ class ViewpointsConfig:
     """The camera looks at a place up to this far from the object's middle, along each axis."""
 
     def __post_init__(self) -> None:
-        settings.require_at_least(self, pairs=1, size=16, second_azimuth_deg=0, jitter=0)
+        settings.require_at_least(self, pairs=1, size=16)
+        _require_between(self, lens_mm=(1, 1000), sensor_mm=(1, 1000), second_azimuth_deg=(0, 180), jitter=(0, 10))
+        _require_between(self, zenith_deg=(0.1, 179.9), distance=(0.9, 100))  # half the diagonal of a cube: 0.87
 
 
 @dataclass(frozen=True)
@@ -53,6 +66,9 @@ class LookConfig:
     materials: str | None = None
     """Folder of materials for the plane (a picture each, or a folder each with albedo, height and roughness); None:
     procedural ones."""
+
+    def __post_init__(self) -> None:
+        _require_between(self, places=(0, 1000), strength=(0.01, 100))
 
 
 @dataclass(frozen=True)
@@ -98,6 +114,7 @@ class MeshConfig:
 
     def __post_init__(self) -> None:
         settings.require_at_least(self, max_faces=1)
+        _require_between(self, min_mask_share=(0, 1))
 
 
 @dataclass(frozen=True)
@@ -122,3 +139,6 @@ class RenderConfig:
     """Of the images; views are encoded once more."""
     seed: int = 0
     """Of everything that is drawn, together with the object's id."""
+
+    def __post_init__(self) -> None:
+        _require_between(self, jpeg_quality=(1, 100))

@@ -119,7 +119,8 @@ def mesh_fingerprint(source: RenderSource) -> dict[str, Any]:
                 read[legible(name)] = None
     except OSError as error:
         raise BadInput(f"cannot be read ({error.strerror})", where=error.filename or source.path) from error
-    return {"id": source.id, "category": source.category, "instance": source.instance, "up": source.up, "files": read}
+    value = {"id": source.id, "category": source.category, "instance": source.instance, "up": source.up, "files": read}
+    return value if source.subset is None else {**value, "subset": source.subset}
 
 
 def _content(path: Path) -> str | None:
@@ -179,9 +180,14 @@ def _expand(path: Path, above: set[Path], *, top: bool) -> Iterator[Path | Sourc
     entries = sorted((p for p in path.iterdir() if not p.name.startswith(".")), key=natural_order)
     any_mesh, place = False, path.resolve()
     for entry in entries:
-        if entry.suffix.lower() in MESH_SUFFIXES and entry.is_file():
+        if entry.suffix.lower() in MESH_SUFFIXES and not entry.is_dir():
             any_mesh = True
-            yield entry
+            if entry.is_file():
+                yield entry
+            else:
+                what = "is a link to nothing" if entry.is_symlink() else "is no regular file"
+                error = BadInput(what, where=entry, remedy="Put the mesh there, or remove it")
+                yield sequence_id(legible(name_of(entry))), entry, error
     if place not in above:  # a link to a folder above would never end
         for entry in entries:
             if entry.is_dir():

@@ -19,15 +19,16 @@ import numpy as np
 from dope.common import files
 from dope.common.errors import BadInput
 from pipeline import stages
-from pipeline.children import Notify, run_in_child
+from pipeline.children import Limits, Notify, run_in_child
 from pipeline.geometry import Camera
 from pipeline.masks.mask_io import write_masks
 from pipeline.prepare import RENDERS_A_PROCESS
 from pipeline.render.cameras import paired_cameras
 from pipeline.render.check import seen_by_both
 from pipeline.render.config import CyclesConfig, FastConfig, RenderConfig
+from pipeline.render.cycles import folders
 from pipeline.render.find import RenderSource, mesh_fingerprint
-from pipeline.render.scene import Picture, Renderer, Scene
+from pipeline.render.scene import RENDERER_VERSIONS, Picture, Renderer, Scene
 from pipeline.sequence import Frame, Sequence, SequenceInfo, write_image
 from pipeline.stages import StageResult, run_stage
 from pipeline.tasks import RunOptions, Task, Unwatched, Watcher, already_done, run_tasks
@@ -84,7 +85,7 @@ def prepare_renders(
         DopeError: the renderer is not installed, or cannot be started.
         DiskFull: the disk is full; finished stages keep their results.
     """
-    given = _folders(config)
+    given = {"renderer_version": RENDERER_VERSIONS[config.renderer], **_folders(config)}
     settled = _settled(config)
     tasks = []
     for source in sources:
@@ -98,16 +99,20 @@ def prepare_renders(
         tasks.append(Task(folder, RENDER_STAGES, plan, _render_one, (source, inputs, config), refusal))
     if any(task.refusal is None and already_done(task, options) is None for task in tasks):
         _require_renderer(config, options)
-    return run_tasks(tasks, options, watcher or Unwatched(), reuse=RENDERS_A_PROCESS)
+    try:
+        return run_tasks(tasks, options, watcher or Unwatched(), reuse=RENDERS_A_PROCESS)
+    finally:
+        if config.renderer == "cycles":
+            folders.sweep()  # children are ended by a signal
 
 
 def _require_renderer(config: RenderConfig, options: RunOptions) -> None:
     """Start the renderer once, in a process of its own: where it is missing, that is one error, not one an object."""
-    run_in_child(_start_renderer, config, limits=options.limits)
+    run_in_child(_start_renderer, config, options.limits, limits=options.limits)
 
 
-def _start_renderer(config: RenderConfig, notify: Notify) -> None:
-    _renderer(config).close()
+def _start_renderer(config: RenderConfig, limits: Limits, notify: Notify) -> None:
+    _renderer(config, limits).close()
 
 
 def _settled(config: RenderConfig) -> RenderConfig:
@@ -126,7 +131,7 @@ def _marks(config: RenderConfig, inputs: Any) -> dict[str, str]:
 def _fingerprint(source: ObjectSource) -> dict[str, Any]:
     if isinstance(source, ProceduralSource):
         return {"id": source.id, "number": source.number, "seed": source.seed}
-    return {"id": source.id, "category": source.category, "up": source.up, **mesh_fingerprint(source)}
+    return mesh_fingerprint(source)
 
 
 def _folders(config: RenderConfig) -> dict[str, Any]:
@@ -166,7 +171,7 @@ def _render_one(
     sequence, settled = Sequence(folder), _settled(config)
     marks = _marks(settled, inputs)
     work: list[tuple[str, Any, Any, Callable[[], dict[str, Any]]]] = [
-        ("frames", settled, inputs, lambda: render_frames(source, sequence, config)),
+        ("frames", settled, inputs, lambda: render_frames(source, sequence, config, options.limits)),
         ("sfm", None, marks["frames"], lambda: place_cameras(source, sequence, config)),
         ("depth", None, marks["sfm"], lambda: describe_depth(sequence)),
     ]
@@ -180,14 +185,14 @@ def _render_one(
     return rows
 
 
-def render_frames(source: ObjectSource, sequence: Sequence, config: RenderConfig) -> dict[str, Any]:
+def render_frames(source: ObjectSource, sequence: Sequence, config: RenderConfig, limits: Limits) -> dict[str, Any]:
     """The stage `frames`: the object loaded, posed, put in its scene and rendered; pairs that hardly show it dropped.
 
     Raises:
         BadInput: the mesh cannot be used, or no pair of views shows enough of it.
     """
     scene = build_scene(source, config)
-    renderer = _renderer(config)
+    renderer = _renderer(config, limits)
     pictures = list(renderer.render(scene))
     cameras = [shot.camera for shot in scene.shots]
     rows = _frames(pictures, cameras, config)
@@ -249,19 +254,19 @@ def build_scene(source: ObjectSource, config: RenderConfig) -> Scene:
 _renderers: dict[Any, Renderer] = {}
 
 
-def _renderer(config: RenderConfig) -> Renderer:
-    """This process's renderer: contexts and Blender are started once."""
+def _renderer(config: RenderConfig, limits: Limits) -> Renderer:
+    """This process's renderer: contexts and Blender are started once. `limits` are those of Blender's process."""
     its = config.fast if config.renderer == "fast" else config.cycles
-    if its not in _renderers:
+    if (its, limits) not in _renderers:
         if isinstance(its, FastConfig):
             from pipeline.render.fast import FastRenderer
 
-            _renderers[its] = FastRenderer(its)
+            _renderers[its, limits] = FastRenderer(its)
         else:
             from pipeline.render.cycles.renderer import CyclesRenderer
 
-            _renderers[its] = CyclesRenderer(its)
-    return _renderers[its]
+            _renderers[its, limits] = CyclesRenderer(its, limits)
+    return _renderers[its, limits]
 
 
 def _frames(pictures: list[Picture], cameras: list[Camera], config: RenderConfig) -> list[Frame]:
@@ -272,7 +277,7 @@ def _frames(pictures: list[Picture], cameras: list[Camera], config: RenderConfig
     ]
     for one, two in zip(rows[::2], rows[1::2], strict=True):
         least = min(float(pictures[row.frame].mask.mean()) for row in (one, two))
-        if least < config.mesh.min_mask_share:
+        if least < config.mesh.min_mask_share or not least:
             one.dropped = two.dropped = f"the object fills {least:.2%} of a view of this pair"
     return rows
 

@@ -26,7 +26,7 @@ class Part:
         faces: (F, 3) int64, counter-clockwise from outside where the mesh has an outside.
         normals: (V, 3) unit, or None: flat shading by the faces' own.
         uv: (V, 2), (0, 0) the texture's bottom-left corner, or None.
-        colours: (V, 3) sRGB in [0, 1], or None.
+        colours: (V, 3) sRGB in [0, 1], mixed as linear light between vertices, or None.
         texture: (H, W, 3) uint8 sRGB, first row at the top; wraps around. None without one.
         colour: (3,) sRGB in [0, 1], multiplies texture and vertex colours; None where the file gives no material.
     """
@@ -159,11 +159,15 @@ class Picture:
     depth: NDArray[np.float32]
 
 
+RENDERER_VERSIONS = {"fast": 2, "cycles": 2}
+"""Raised by hand when a renderer's pictures of the same scene change; part of the fingerprint of what it made."""
+
+
 class Renderer(Protocol):
     """Makes pictures: a function of the scene and of the renderer's settings, whatever was rendered before."""
 
     version: str
-    """Part of the fingerprint of what it made: the program and its version."""
+    """The renderer, `RENDERER_VERSIONS` of it and what program it uses, as the details of the stage `frames` say."""
 
     def render(self, scene: Scene) -> Iterator[Picture]:
         """A picture for each shot, in order. Raises BadInput where the scene cannot be rendered."""

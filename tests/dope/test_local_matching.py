@@ -13,9 +13,9 @@ from dope.lowshot.episodes import EpisodeConfig, Episodes, sample_episodes
 from dope.lowshot.matching import (
     BestShots,
     MatchingConfig,
+    QueryDescriptors,
     best_similarities,
     query_cells,
-    score_support,
 )
 from dope.networks import DopeNetwork, NetworkConfig
 
@@ -131,7 +131,7 @@ def test_predictions_equal_a_naive_implementation() -> None:
     for s in best.support_views.tolist():
         queries = best.queries_of(s)
         descriptors = torch.stack([as_cells(views[q]).at(cells[q]) for q in queries.tolist()])
-        best.add(s, queries, score_support(descriptors, descriptors.norm(dim=2), as_cells(views[s])))
+        best.add(s, queries, QueryDescriptors(descriptors, descriptors.norm(dim=2)).scores(as_cells(views[s])))
     (predicted,) = best.predictions()
 
     for e in range(len(episodes)):

@@ -15,12 +15,13 @@ from dope.lowshot.embedding import DopeEmbedder
 from dope.lowshot.episodes import EpisodeConfig, sample_episodes
 from dope.lowshot.local import classify_locally
 from dope.lowshot.matching import MatchingConfig
+from dope.lowshot.screening import Screen
 from dope.lowshot.views import ViewShards
 from dope.lowshot.work import Spill, Work
 from dope.networks import DopeNetwork, NetworkConfig
 from dope.networks.untrained import untrained_network
 
-NETWORK = NetworkConfig(width=0.125, pyramid=16, projector=(24, 12))
+NETWORK = NetworkConfig(width=0.125, pyramid=16, projector=(24, 64))
 ONE = EpisodeConfig(ways=3, shots=1, queries=2, episodes=8)
 PROTOCOLS = (ONE, replace(ONE, shots=2, episodes=5), replace(ONE, ways=2, shots=3, queries=1, episodes=5, seed=4))
 CONFIG = MatchingConfig(points=6)
@@ -74,6 +75,8 @@ def test_the_naive_predictions_are_not_all_the_same_and_have_both_kinds_of_queri
     grids = [naive_lowshot.descriptors(network_with_masks(), views, i).norm(dim=-1) for i in range(len(views))]
     foregrounds = np.array([int((grid >= CONFIG.foreground).sum()) for grid in grids])
     assert (foregrounds >= CONFIG.points).sum() > 4
+    described = torch.cat([naive_lowshot.descriptors(network_with_masks(), views, i).flatten(0, 1) for i in range(3)])
+    assert Screen.of(described) is not None  # and the search for the best match is by a subspace
     assert any(0.0 < float(level) < 0.3 for grid in grids for level in grid.ravel())
 
 

@@ -193,7 +193,7 @@ def test_wrong_flags_are_explained(shards: Path, run: Path, flags: list[str], me
 
 def test_old_result_rows_without_the_new_columns_are_read(tmp_path: Path, shards: Path) -> None:
     row = evaluate(None, shards, config(), network=NETWORK).rows[0]
-    values = {name: value for name, value in vars(row).items()}
+    values = dict(vars(row))
     for name in ("method", "run", "table", "table_split", "part"):
         del values[name]
     (tmp_path / "results.json").write_text(json.dumps([values]))

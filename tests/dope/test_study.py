@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +84,10 @@ def test_what_others_start_from_comes_first_and_nothing_is_done_twice(
     assert sorted(trained) == sorted(calls.of("eval")) == sorted(piece.name for piece in outcome.done)
     calls.commands.clear()
     run_study(METHODS, CONFIG, tmp_path, lambda text: None)
-    assert calls.of("train") == []  # finished runs are evaluated again, which is cheap and may be asked otherwise
+    assert calls.commands == []
+    otherwise = replace(CONFIG, evaluation=("--ways", "3"))
+    run_study(METHODS[-1:], otherwise, tmp_path, lambda text: None)
+    assert calls.of("train") == [] and calls.of("eval") == ["dope-seed0", "dope-seed1"]
 
 
 def test_a_failure_costs_what_starts_from_it_and_is_tried_again(
@@ -109,6 +113,7 @@ def test_other_settings_train_again(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     run_study(ABLATIONS[:1], CONFIG, tmp_path, lambda text: None)
     other = StudyConfig(SHARDS, "test", settings=("data.image_size=64",), seeds=(0,))
     run_study(ABLATIONS[:1], other, tmp_path, lambda text: None)
+    assert calls.of("eval") == ["dope-seed0", "dope-seed1", "dope-seed0"]
     assert calls.of("train") == ["dope-seed0", "dope-seed1", "dope-seed0"]  # `dope train` itself says what differs
 
 

@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dope.common import settings
+from dope.common.errors import UsageError
 from pipeline.render.cameras import looking_at, paired_cameras
 from pipeline.render.check import seen_by_both
-from pipeline.render.config import ViewpointsConfig
+from pipeline.render.config import RenderConfig, ViewpointsConfig
 from tests.pipeline.analytic import picture_of
 
 CONFIG = ViewpointsConfig()
@@ -83,3 +85,23 @@ def test_pictures_that_are_wrong_do_not(wrong: str) -> None:
     else:
         camera = replace(camera, t=camera.t + np.array([0.02, 0, 0]))
     assert np.median(seen_by_both(one, camera, two, other).miss_px) > 0.1
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "viewpoints.zenith_deg=[0,10]",
+        "viewpoints.zenith_deg=[80,10]",
+        "viewpoints.zenith_deg=[.nan,10]",
+        "viewpoints.distance=[-2,-1]",
+        "viewpoints.lens_mm=0",
+        "viewpoints.sensor_mm=0",
+        "look.strength=[-1,-1]",
+        "look.places=-1",
+        "mesh.min_mask_share=5",
+        "jpeg_quality=500",
+    ],
+)
+def test_settings_that_show_nothing_are_refused_before_any_object(setting: str) -> None:
+    with pytest.raises(UsageError, match=setting.split("=")[0].rsplit(".", maxsplit=1)[-1]):
+        settings.override(RenderConfig(), [setting])

@@ -15,8 +15,9 @@ import pytest
 
 from dope.common.errors import BadInput, DopeError
 from pipeline.geometry import Camera
+from pipeline.render.exposure import to_linear as linear
 from pipeline.render.fast import FastRenderer, context
-from pipeline.render.fast.geometry import geometry_of, linear, occluder_faces
+from pipeline.render.fast.geometry import geometry_of, occluder_faces
 from pipeline.render.scene import Light, Model, Part, Picture, Scene, Shot, Surface
 from tests.pipeline.fast_scenes import (
     box,

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.render.exposure import to_linear as linear
 from pipeline.render.fast import FastRenderer
-from pipeline.render.fast.geometry import linear
 from pipeline.render.scene import Light, Part, Shot, Surface
 from tests.pipeline.fast_scenes import (
     box,
@@ -75,6 +75,18 @@ def test_colours_of_vertices_parts_and_none(fast: FastRenderer) -> None:
     assert both[1] < 0.5 * middle(colours=colours)[1]
     brighter = middle(colour=(0.8, 0.8, 0.8)) / grey
     assert np.allclose(brighter, linear(np.array(0.8)) / linear(np.array(0.6)), rtol=0.12)
+
+
+def test_between_vertices_their_light_is_mixed(fast: FastRenderer) -> None:
+    """As Blender and glTF have it: half way between black and white is half the light, not half the sRGB."""
+    corners = np.array([[0.0, -0.5, -0.5], [0, 0.5, -0.5], [0, 0.5, 0.5], [0, -0.5, 0.5]])
+    camera = camera_at(0, 89.9, 2)
+
+    def middle(*levels: float) -> float:
+        card = Part(corners, np.array([[0, 1, 2], [0, 2, 3]]), colours=np.repeat(levels, 3).reshape(4, 3))
+        return float(linear(one(fast, scene(card, cameras=camera)).image[48, 48] / 255.0).mean())
+
+    assert abs(middle(0, 0, 1, 1) - (middle(0, 0, 0, 0) + middle(1, 1, 1, 1)) / 2) < 0.02
 
 
 def voronoi_cells(points: np.ndarray, cells: float, seed: int, count: int) -> np.ndarray:

@@ -11,6 +11,9 @@ from dope.common.errors import BadInput, UsageError
 from pipeline.inputs.sources import input_errors_as_rows
 from pipeline.render.find import RenderSource, find_meshes, mesh_fingerprint
 from pipeline.render.layouts import SYNSETS
+from pipeline.render.load import load_model
+from pipeline.render.mesh_files.obj import LARGEST_LIBRARY
+from pipeline.render.mesh_files.references import references
 
 SPLITS = Path(__file__).parents[2] / "dope/splits"
 
@@ -67,6 +70,13 @@ def test_modelnet_gives_category_object_and_subset(tmp_path: Path) -> None:
         sources = found(given)[:2]
         assert [(s.id, s.category, s.subset) for s in sources] == expected and sources[0].instance == sources[0].id
     assert [(s.category, s.subset) for s in found(tmp_path / "ModelNet40")[2:]] == [("train", None)], "no such name"
+
+
+def test_a_mesh_that_went_to_the_other_subset_is_made_anew(tmp_path: Path) -> None:
+    train = touch(tmp_path / "chair/train/chair_0001.off")
+    before = mesh_fingerprint(found(train)[0])
+    (tmp_path / "chair/train").rename(tmp_path / "chair/test")
+    assert mesh_fingerprint(found(tmp_path / "chair/test/chair_0001.off")[0]) != before
 
 
 def test_shapenet_gives_the_synsets_name_in_both_versions(tmp_path: Path) -> None:
@@ -158,6 +168,18 @@ def test_links_in_a_circle_end(tmp_path: Path) -> None:
     assert [s.path for s in found(tmp_path)] == [mesh]
 
 
+def test_links_to_nothing_and_pipes_are_rows(tmp_path: Path) -> None:
+    mesh = touch(tmp_path / "a/x.obj")
+    (tmp_path / "a/gone.obj").symlink_to("nowhere.obj")
+    (tmp_path / "a/loop.stl").symlink_to("loop.stl")
+    os.mkfifo(tmp_path / "a/pipe.ply")
+    sources, errors = find_meshes([tmp_path])
+    assert [s.path for s in sources] == [mesh]
+    reasons = {path.name: str(error) for _, path, error in errors}
+    assert sorted(reasons) == ["gone.obj", "loop.stl", "pipe.ply"]
+    assert "is a link to nothing" in reasons["gone.obj"] and "no regular file" in reasons["pipe.ply"]
+
+
 def test_the_fingerprint_is_of_all_that_is_read(tmp_path: Path) -> None:
     def of(name: str) -> dict[str, object]:
         value = mesh_fingerprint(found(tmp_path / name)[0])
@@ -190,3 +212,19 @@ def test_the_fingerprint_is_of_all_that_is_read(tmp_path: Path) -> None:
     (tmp_path / "none.obj").unlink()
     with pytest.raises(BadInput, match=r"none\.obj"):
         mesh_fingerprint(source)
+
+
+def test_names_are_found_in_little_time_and_memory_whatever_a_file_holds(tmp_path: Path) -> None:
+    spaces = touch(tmp_path / "spaces.obj", f"mtllib a{' ' * 1_000_000}b.mtl\nmtllib  \nmtllib\tc d.mtl \r\nv 0 0 0\n")
+    assert [name for name, _ in references(spaces)] == ["a", "b.mtl", "c", "d.mtl"]
+    touch(tmp_path / "c d.mtl")
+    assert [name for name, _ in references(spaces)] == ["a", "b.mtl", "c d.mtl"]
+    large = touch(tmp_path / "large.obj", "mtllib large.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    with touch(tmp_path / "large.mtl").open("wb") as library:
+        library.truncate(LARGEST_LIBRARY + 1)
+    assert references(large) == [("large.mtl", tmp_path / "large.mtl")]
+    with pytest.raises(BadInput, match=r"large\.mtl: is huge for a library of materials"):
+        load_model(large, max_faces=9)
+    deep = '{"extras": %s, "buffers": [{"uri": "a%%20\\u00e4.bin"}, {"uri": "data:,x"}], "images": [{"uri" : "../b"}]}'
+    named = references(touch(tmp_path / "deep.gltf", deep % ("[" * 99_999 + "]" * 99_999)))
+    assert named == [("a ä.bin", tmp_path / "a ä.bin"), ("../b", None)]

@@ -16,6 +16,7 @@ import pytest
 from dope.common import settings
 from dope.common.errors import BadInput, DopeError, UsageError
 from pipeline.cameras.colmap import read_points
+from pipeline.children import Limits
 from pipeline.commands.render import _limited
 from pipeline.correspond.match import CorrespondConfig
 from pipeline.correspond.pairs import PairsConfig
@@ -24,15 +25,17 @@ from pipeline.prepare import correspond_all
 from pipeline.render import prepare
 from pipeline.render.cameras import paired_cameras
 from pipeline.render.config import CyclesConfig, FastConfig, RenderConfig, ViewpointsConfig
+from pipeline.render.cycles import folders
 from pipeline.render.find import find_meshes
 from pipeline.render.prepare import ProceduralSource, prepare_renders
-from pipeline.render.scene import Picture, Scene
+from pipeline.render.scene import RENDERER_VERSIONS, Picture, Scene
 from pipeline.sequence import Sequence
 from pipeline.tasks import RunOptions
 from tests.pipeline.analytic import SphereRenderer
 
 CONFIG = settings.override(RenderConfig(recipe="procedural"), ["viewpoints.pairs=4", "viewpoints.jitter=0.1"])
 SOURCE = ProceduralSource(0, 0)
+RENDERER = prepare._renderer
 BOX = """v -1 -1 -1\nv 1 -1 -1\nv 1 1 -1\nv -1 1 -1\nv -1 -1 1\nv 1 -1 1\nv 1 1 1\nv -1 1 1
 f 4 3 2 1\nf 5 6 7 8\nf 1 2 6 5\nf 2 3 7 6\nf 3 4 8 7\nf 4 1 5 8\n"""
 
@@ -42,7 +45,7 @@ def spheres_in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pipeline.tasks.run_in_child", lambda run, *args, limits, notify: run(*args, notify))
     monkeypatch.setattr("pipeline.children.Children.call", lambda self, run, *args, notify: run(*args, notify))
     monkeypatch.setattr(prepare, "run_in_child", lambda run, *args, limits: run(*args, None))
-    monkeypatch.setattr(prepare, "_renderer", lambda config: SphereRenderer())
+    monkeypatch.setattr(prepare, "_renderer", lambda *_: SphereRenderer())
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +54,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sequence]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pipeline.children.Children.call", lambda self, run, *args, notify: run(*args, notify))
         patch.setattr(prepare, "run_in_child", lambda run, *args, limits: run(*args, None))
-        patch.setattr(prepare, "_renderer", lambda config: SphereRenderer())
+        patch.setattr(prepare, "_renderer", lambda *_: SphereRenderer())
         rows = prepare_renders([SOURCE], work, CONFIG, RunOptions())
     assert [(row.stage, row.status) for row in rows] == [("frames", "ok"), ("sfm", "ok"), ("depth", "ok")], rows
     yield Sequence(work / SOURCE.id)
@@ -121,12 +124,16 @@ def test_pairs_that_hardly_show_the_object_are_dropped_with_their_reason(
                 hidden = number in (1, 4)
                 yield replace(picture, mask=picture.mask & np.False_) if hidden else picture
 
-    monkeypatch.setattr(prepare, "_renderer", lambda config: Vanishing())
+    monkeypatch.setattr(prepare, "_renderer", lambda *_: Vanishing())
     assert all(row.ok for row in prepare_renders([SOURCE], tmp_path, CONFIG, RunOptions()))
     frames = Sequence(tmp_path / SOURCE.id).read_frames()
     assert [frame.dropped is not None for frame in frames] == [True, True, False, False, True, True, False, False]
     assert frames[0].dropped == "the object fills 0.00% of a view of this pair" and frames[0].image is None
-    monkeypatch.setattr(prepare, "_renderer", lambda config: SphereRenderer(radius=0.004))
+    any_share = settings.override(CONFIG, ["mesh.min_mask_share=0"])
+    assert all(row.ok for row in prepare_renders([SOURCE], tmp_path / "any", any_share, RunOptions()))
+    frames = Sequence(tmp_path / "any" / SOURCE.id).read_frames()
+    assert frames[0].dropped and not frames[2].dropped, "a view of nothing is no view, whatever the limit"
+    monkeypatch.setattr(prepare, "_renderer", lambda *_: SphereRenderer(radius=0.004))
     failed, *_ = prepare_renders([SOURCE], tmp_path / "none", CONFIG, RunOptions())
     assert failed.status == "failed" and "no pair of views shows it: it fills 0.0" in str(failed.reason)
 
@@ -141,6 +148,16 @@ def test_only_settings_that_matter_make_it_anew(tmp_path: Path) -> None:
     assert not skipped(replace(CONFIG, seed=1))
     assert not skipped(replace(CONFIG, viewpoints=ViewpointsConfig(pairs=2)))
     assert len(Sequence(tmp_path / SOURCE.id).read_frames()) == 4
+
+
+def test_pictures_of_an_older_version_of_the_renderer_are_made_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert all(row.ok and not row.skipped for row in prepare_renders([SOURCE], tmp_path, CONFIG, RunOptions()))
+    monkeypatch.setitem(RENDERER_VERSIONS, "cycles", 99)
+    assert all(row.skipped for row in prepare_renders([SOURCE], tmp_path, CONFIG, RunOptions()))
+    monkeypatch.setitem(RENDERER_VERSIONS, "fast", 99)
+    assert all(row.ok and not row.skipped for row in prepare_renders([SOURCE], tmp_path, CONFIG, RunOptions()))
 
 
 def test_a_run_that_is_killed_between_stages_ends_with_the_same_bytes(tmp_path: Path) -> None:
@@ -187,10 +204,26 @@ def test_another_mesh_of_the_same_name_does_not_take_its_place(tmp_path: Path) -
     assert "holds the sequence of" in str(row.reason)
 
 
+def test_blender_has_the_limits_of_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    monkeypatch.setattr(prepare, "run_in_child", lambda run, *args, limits: run(*args, None))
+    given: list[Limits] = []
+
+    def begin(config: CyclesConfig, limits: Limits) -> None:
+        given.append(limits)
+        raise DopeError("that is enough")
+
+    monkeypatch.setattr("pipeline.render.cycles.renderer.CyclesRenderer", begin)
+    asked = Limits(minutes=90, memory_gib=3)
+    with pytest.raises(DopeError, match="enough"):
+        prepare_renders([SOURCE], tmp_path, replace(CONFIG, renderer="cycles"), RunOptions(limits=asked))
+    assert given == [asked]
+
+
 def test_a_renderer_that_is_not_there_is_one_error_before_anything_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def missing(config: RenderConfig) -> None:
+    def missing(*_: object) -> None:
         raise DopeError("there is no OpenGL", remedy="Install it")
 
     prepare_renders([SOURCE], tmp_path / "done", CONFIG, RunOptions())
@@ -199,6 +232,31 @@ def test_a_renderer_that_is_not_there_is_one_error_before_anything_is_written(
         prepare_renders([SOURCE, ProceduralSource(1, 0)], tmp_path / "new", CONFIG, RunOptions())
     assert not (tmp_path / "new").exists()
     assert all(row.skipped for row in prepare_renders([SOURCE], tmp_path / "done", CONFIG, RunOptions()))
+
+
+def test_blender_has_the_limits_that_were_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    began = []
+
+    def blender(config: CyclesConfig, limits: Limits) -> SphereRenderer:
+        began.append((config.samples, limits))
+        return SphereRenderer()
+
+    monkeypatch.setattr(prepare, "_renderer", RENDERER)
+    monkeypatch.setattr(prepare, "_renderers", {})
+    monkeypatch.setattr("pipeline.render.cycles.renderer.CyclesRenderer", blender)
+    limits = Limits(minutes=60.0, memory_gib=3.0)
+    config = replace(CONFIG, renderer="cycles", cycles=CyclesConfig(samples=50))
+    assert all(row.ok for row in prepare_renders([SOURCE], tmp_path, config, RunOptions(limits=limits)))
+    assert set(began) == {(50, limits)}
+
+
+def test_nothing_is_left_in_memory_by_children_that_were_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(folders, "_MEMORY", tmp_path / "shm")
+    left = tmp_path / "shm/dope-cycles-left"
+    left.mkdir(parents=True)
+    (left / "lock").touch()
+    prepare_renders([SOURCE], tmp_path / "work", replace(CONFIG, renderer="cycles"), RunOptions())
+    assert not left.exists()
 
 
 @pytest.mark.parametrize("name", ["hdris", "materials"])
@@ -215,6 +273,16 @@ def test_what_is_asked_for_must_make_sense() -> None:
         settings.override(RenderConfig(), ["recipe=modelnett"])
     with pytest.raises(UsageError, match="pairs"):
         settings.override(RenderConfig(), ["viewpoints.pairs=0"])
+
+
+@pytest.mark.parametrize(
+    "setting",
+    ["viewpoints.lens_mm=0", "viewpoints.distance=[4,2]", "viewpoints.distance=[0,1]", "viewpoints.zenith_deg=[80,10]",
+     "viewpoints.jitter=-1", "look.strength=[1,.nan]", "look.places=-1", "mesh.min_mask_share=2", "jpeg_quality=500"],
+)  # fmt: skip
+def test_numbers_that_cannot_be_are_refused_before_anything_is_rendered(setting: str) -> None:
+    with pytest.raises(UsageError, match=setting.split("=")[0].split(".")[-1]):
+        settings.override(RenderConfig(), [setting])
 
 
 def test_limit_is_of_each_category() -> None:

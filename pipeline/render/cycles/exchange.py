@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from dope.common.errors import BadInput
 from pipeline.render.config import CyclesConfig
-from pipeline.render.cycles.exposure import Exposure, show
 from pipeline.render.cycles.exr import read_exr
+from pipeline.render.exposure import Exposure, show
 from pipeline.render.scene import Picture, Scene, Shot
 
 _SKY = 1e9
@@ -64,7 +64,7 @@ def scene_message(scene: Scene, exposure: Exposure, config: CyclesConfig, thread
             "seed": int(surface.seed),
         },
         "ground": ground,
-        "light": {"strength": exposure.strength, "turn": float(scene.light.turn)},
+        "light": {"strength": exposure.gain, "turn": float(scene.light.turn)},
         "cycles": {
             "samples": config.samples,
             "denoise": config.denoise,

@@ -11,6 +11,7 @@ from pathlib import Path
 
 _PREFIX = "dope-cycles-"
 _ROOM = 1 << 30
+_MEMORY = Path("/dev/shm")
 
 
 class PrivateFolder:
@@ -22,7 +23,7 @@ class PrivateFolder:
 
     def __init__(self, where: Path | None = None) -> None:
         where = where or _roomy()
-        _sweep(where)
+        sweep(where)
         # under another name until it is locked, so that nobody takes it for abandoned
         new = Path(tempfile.mkdtemp(prefix=f".{_PREFIX}", dir=where))
         self._lock = os.open(new / "lock", os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
@@ -38,15 +39,19 @@ class PrivateFolder:
 
 
 def _roomy() -> Path:
-    memory = Path("/dev/shm")
     with suppress(OSError):
-        if os.access(memory, os.W_OK) and shutil.disk_usage(memory).free > _ROOM:
-            return memory
+        if os.access(_MEMORY, os.W_OK) and shutil.disk_usage(_MEMORY).free > _ROOM:
+            return _MEMORY
+    return _temporary()
+
+
+def _temporary() -> Path:
     return Path(tempfile.gettempdir())
 
 
-def _sweep(where: Path) -> None:
-    for folder in where.glob(f"{_PREFIX}*"):
+def sweep(*places: Path) -> None:
+    """Remove the folders that processes left which are no more; by default wherever they may lie."""
+    for folder in (path for where in places or (_MEMORY, _temporary()) for path in where.glob(f"{_PREFIX}*")):
         with suppress(OSError):
             if folder.is_symlink() or folder.stat().st_uid != os.getuid():
                 continue

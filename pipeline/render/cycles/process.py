@@ -117,7 +117,7 @@ class BlenderProcess:
             self.close()
             raise ChildFailed(
                 f"Blender took longer than the object's {self._limits.minutes:g} minutes and was stopped{self._said()}",
-                remedy="Fewer samples (--set cycles.samples=N) or smaller pictures take less",
+                remedy="Raise --minutes and add --retry-failed, or ask for fewer samples (cycles.samples)",
             ) from None
         except (EOFError, BrokenPipeError, ConnectionResetError):
             raise ChildFailed(self._cause_of_death()) from None

@@ -12,12 +12,10 @@ from pipeline.children import Limits
 from pipeline.render.config import CyclesConfig
 from pipeline.render.cycles import process
 from pipeline.render.cycles.exchange import read_picture, scene_message, shot_message
-from pipeline.render.cycles.exposure import expose
 from pipeline.render.cycles.folders import PrivateFolder
-from pipeline.render.scene import Picture, Scene
+from pipeline.render.exposure import expose, white_under
+from pipeline.render.scene import RENDERER_VERSIONS, Picture, Scene
 
-SCENE_VERSION = 1
-"""Raised by hand when the pictures of the same scene change."""
 REUSE = 100
 """Objects that a process renders before the next one takes its place."""
 
@@ -47,7 +45,7 @@ class CyclesRenderer:
         except BaseException:
             self.close()
             raise
-        self.version = f"cycles {SCENE_VERSION}, Blender {blender}"
+        self.version = f"cycles {RENDERER_VERSIONS['cycles']}, Blender {blender}"
 
     def render(self, scene: Scene) -> Iterator[Picture]:
         """A picture for each shot, in order.
@@ -57,7 +55,7 @@ class CyclesRenderer:
             DopeError: Blender could not be started.
         """
         folder = self._folder.path
-        exposure = expose(scene.light, scene.ground)
+        exposure = expose(white_under(scene.light, scene.ground), scene.ground, scene.light.strength)
         message = scene_message(scene, exposure, self._config, self._limits.threads, folder / "scene.npz")
         requests = [shot_message(shot, folder / "shot.exr") for shot in scene.shots]
         blender = self._ready()

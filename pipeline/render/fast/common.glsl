@@ -26,15 +26,14 @@ vec3 to_srgb(vec3 c) {
     return mix(1.055 * pow(max(c, 1e-6), vec3(1.0 / 2.4)) - 0.055, c * 12.92, lessThanEqual(c, vec3(0.0031308)));
 }
 
-// As Khronos PBR Neutral above its toe: colours below START stay true, brighter ones are compressed and lose their hue.
+// exposure.show in Python says what the curve is.
 vec3 tone_mapped(vec3 c) {
-    const float START = 0.72, FADE = 0.15;
     c *= exposure;
     float peak = max(c.r, max(c.g, c.b));
-    float d = 1.0 - START;
-    float squeezed = 1.0 - d * d / (max(peak, START) + d - START);
-    vec3 bright = mix(c * (squeezed / max(peak, START)), vec3(squeezed), 1.0 - 1.0 / (FADE * (peak - squeezed) + 1.0));
-    return peak < START ? c : bright;
+    float d = 1.0 - SHOULDER;
+    float squeezed = 1.0 - d * d / (max(peak, SHOULDER) + d - SHOULDER);
+    vec3 bright = mix(c * (squeezed / max(peak, SHOULDER)), vec3(squeezed), 1.0 - 1.0 / (FADE * (peak - squeezed) + 1.0));
+    return peak < SHOULDER ? c : bright;
 }
 
 vec3 shown(vec3 radiance) {

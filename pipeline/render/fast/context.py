@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dope.common.errors import DopeError
+from pipeline.render import exposure
 from pipeline.render.fast import light
 
 if TYPE_CHECKING:
@@ -26,6 +27,8 @@ CONSTANTS = {
     "DIRECTIONS": light.DIRECTIONS,
     "CASTERS": light.CASTERS,
     "MAX_COLOURS": MAX_COLOURS,
+    "SHOULDER": exposure.SHOULDER,
+    "FADE": exposure.FADE,
 }
 """Macros of every shader."""
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dope.common.errors import BadInput
+from pipeline.render.exposure import to_linear
 from pipeline.render.scene import Model, Part
 
 GREY = 0.6  # sRGB, of parts that say nothing of how they look
@@ -24,7 +25,7 @@ class Geometry:
 
     Attributes:
         vertices: (V, 8) float32: x y z u, normal v. A normal of length 0: flat shading.
-        colours: (V, 4) uint8 sRGB of vertices.
+        colours: (V, 4) float16 linear colours of vertices: between them light is mixed, as in Blender and glTF.
         faces: (F, 4) uint32: three vertices and the part.
         materials: (P, 4) float32: linear colour, and the texture's number (-1: none).
         textures: (T, S, S', 4) uint8 sRGB, first row at the top.
@@ -32,7 +33,7 @@ class Geometry:
     """
 
     vertices: NDArray[np.float32]
-    colours: NDArray[np.uint8]
+    colours: NDArray[np.float16]
     faces: NDArray[np.uint32]
     materials: NDArray[np.float32]
     textures: NDArray[np.uint8]
@@ -65,7 +66,7 @@ def geometry_of(model: Model) -> Geometry:
     textured = [number for number, part in enumerate(parts) if part.texture is not None and part.uv is not None]
     materials = np.full((len(parts), 4), -1, np.float32)
     for number, part in enumerate(parts):
-        materials[number, :3] = linear(_base_colour(part))
+        materials[number, :3] = to_linear(_base_colour(part))
     materials[textured, 3] = np.arange(len(textured))
     colours = np.concatenate([_colours(part) for part in parts])
     points = vertices[:, :3].astype(np.float64)
@@ -107,11 +108,6 @@ def _clustered(geometry: Geometry, cells: int) -> NDArray[np.uint32]:
     return np.concatenate([first[corners[np.sort(solid)]].astype(np.uint32), faces[both]])
 
 
-def linear(srgb: NDArray[np.floating]) -> NDArray[np.floating]:
-    """sRGB in [0, 1] to linear light (IEC 61966-2-1)."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((np.maximum(srgb, 0) + 0.055) / 1.055) ** 2.4)
-
-
 def _vertices(part: Part) -> NDArray[np.float32]:
     out = np.zeros((len(part.vertices), 8), np.float32)
     out[:, :3] = part.vertices
@@ -123,11 +119,11 @@ def _vertices(part: Part) -> NDArray[np.float32]:
     return out
 
 
-def _colours(part: Part) -> NDArray[np.uint8]:
-    if part.colours is None:
-        return np.full((len(part.vertices), 4), 255, np.uint8)
-    rgb = np.clip(np.rint(255 * np.nan_to_num(part.colours)), 0, 255).astype(np.uint8)
-    return np.column_stack([rgb, np.full(len(rgb), 255, np.uint8)])
+def _colours(part: Part) -> NDArray[np.float16]:
+    out = np.ones((len(part.vertices), 4), np.float16)
+    if part.colours is not None:
+        out[:, :3] = to_linear(np.clip(np.nan_to_num(part.colours), 0, 1))
+    return out
 
 
 def _base_colour(part: Part) -> NDArray[np.floating]:

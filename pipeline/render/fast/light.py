@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from pipeline.geometry import Floats
-from pipeline.render.fast.geometry import linear
+from pipeline.render.exposure import LUMINANCE, SIDES, expose, mean_albedo
 from pipeline.render.scene import Ground, Light
 from pipeline.render.skies import directions_of
 
@@ -32,11 +32,6 @@ CASTERS = KEYS * KEY_SAMPLES + GROUND_SAMPLES
 KEY_RADIUS_DEG = (1.5, 16.0)
 """Smallest and largest radius of a key light: the sun's own is less than a shadow map resolves."""
 KEY_REACH_DEG = 24.0
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-WHITE = 0.55
-"""Radiance that a white surface gets at strength 0.65 before tone mapping."""
-USUAL_ALBEDO = 0.25
-USUAL_STRENGTH = 0.65
 
 
 @dataclass(frozen=True)
@@ -89,12 +84,11 @@ def lights_of(light: Light, ground: Ground | None) -> Lights:
         if found is None:
             break
         keys[number], key_directions[number], radii[number] = found
-    bounce, reflects = np.zeros(3), USUAL_ALBEDO
+    bounce = np.zeros(3)
     if ground is not None:
         up = (radiance * angle[..., None] * np.maximum(toward[..., 2:], 0)).sum(axis=(0, 1)) / np.pi
         up += (keys * np.maximum(key_directions[:, 2:], 0)).sum(axis=0)
-        albedo = linear(cv2.resize(ground.albedo, (1, 1), interpolation=cv2.INTER_AREA)[0, 0] / 255.0)
-        bounce, reflects = up * albedo, float(albedo @ LUMINANCE)
+        bounce = up * mean_albedo(ground)
         radiance[toward[..., 2] <= 0] = bounce
     power = (radiance * angle[..., None]).reshape(-1, 3)
     harmonics = (_COSINE * _NORM * _NORM / np.pi)[:, None] * (basis(toward).reshape(-1, 9).T @ power)
@@ -109,9 +103,11 @@ def lights_of(light: Light, ground: Ground | None) -> Lights:
     for key in range(KEYS):
         chosen = slice(key * KEY_SAMPLES, (key + 1) * KEY_SAMPLES)
         shares[chosen, 1 + key] = there[chosen]
-    exposure = _exposure(_white(harmonics, keys, key_directions), reflects) * (light.strength / USUAL_STRENGTH)
+    exposure = expose(_white(harmonics, keys, key_directions), ground, light.strength)
     samples, on_ground = np.concatenate([discs, sphere]), np.concatenate([discs, above])
-    return Lights(harmonics, keys, key_directions, samples, weights, on_ground, shares, bounce, exposure)
+    return Lights(
+        harmonics, keys, key_directions, samples, weights, on_ground, shares, bounce, exposure.gain * exposure.balance
+    )
 
 
 def _take_key(radiance: Floats, toward: Floats, angle: Floats) -> tuple[Floats, Floats, float] | None:
@@ -187,14 +183,6 @@ def frame_of(directions: Floats) -> tuple[Floats, Floats]:
 
 
 def _white(harmonics: Floats, keys: Floats, key_directions: Floats) -> Floats:
-    """Mean radiance (3,) of a white object: of surfaces that look up and to all sides."""
-    normals = np.array([[0, 0, 1.0], [0, 0, 1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
-    light = basis(normals) @ harmonics + np.maximum(normals @ key_directions.T, 0) @ keys
+    """Mean radiance (3,) of white surfaces that look to `SIDES`."""
+    light = basis(SIDES) @ harmonics + np.maximum(SIDES @ key_directions.T, 0) @ keys
     return np.asarray(np.maximum(light, 1e-6).mean(axis=0))
-
-
-def _exposure(white: Floats, albedo: float) -> Floats:
-    """As a camera would: WHITE for a white object, less over a bright ground, and half of the light's hue gone."""
-    bright = float(white @ LUMINANCE)
-    scale = WHITE / bright * np.clip(USUAL_ALBEDO / max(albedo, 1e-3), 0.2, 5) ** 0.35
-    return np.asarray(scale * (bright / white) ** 0.6)

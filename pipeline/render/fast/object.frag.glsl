@@ -2,7 +2,7 @@
 // KIND: 0 colours of parts and vertices, 1 one colour, 2 Voronoi cells, 3 as 0 with textures.
 #include "common.glsl"
 #include "hit.glsl"
-layout(std430, binding = 2) readonly buffer Colours { uint colours[]; };
+layout(std430, binding = 2) readonly buffer Colours { uvec2 colours[]; };      // linear: four halves a vertex
 layout(std430, binding = 3) readonly buffer Materials { vec4 materials[]; };  // linear colour, texture or -1
 
 uniform sampler2D seen;
@@ -66,12 +66,15 @@ vec2 uv_of(uvec4 face, vec3 s) {
            s.z * vec2(vertices[c].w, vertices[c + 1u].w);
 }
 
+vec3 colour_of(uint vertex) {
+    return vec3(unpackHalf2x16(colours[vertex].x), unpackHalf2x16(colours[vertex].y).x);
+}
+
 vec3 own_colour(Hit hit) {
     vec4 material = materials[hit.face.w];
     vec3 s = hit.share;
-    vec3 mixed = s.x * unpackUnorm4x8(colours[hit.face.x]).rgb + s.y * unpackUnorm4x8(colours[hit.face.y]).rgb +
-                 s.z * unpackUnorm4x8(colours[hit.face.z]).rgb;
-    vec3 colour = material.rgb * to_linear(mixed);
+    vec3 mixed = s.x * colour_of(hit.face.x) + s.y * colour_of(hit.face.y) + s.z * colour_of(hit.face.z);
+    vec3 colour = material.rgb * mixed;
 #if KIND == 3
     vec3 A = vertices[2u * hit.face.x].xyz;
     vec3 e1 = vertices[2u * hit.face.y].xyz - A, e2 = vertices[2u * hit.face.z].xyz - A;

@@ -27,7 +27,7 @@ from pipeline.render.fast.context import context
 from pipeline.render.fast.geometry import Geometry, geometry_of
 from pipeline.render.fast.targets import Targets
 from pipeline.render.fast.upload import SceneOnDevice
-from pipeline.render.scene import Picture, Scene, Shot
+from pipeline.render.scene import RENDERER_VERSIONS, Picture, Scene, Shot
 
 NEAREST = 1e-3
 """Nothing nearer to the camera is seen."""
@@ -42,7 +42,7 @@ class FastRenderer:
         DopeError: moderngl is not installed, or there is no EGL with OpenGL 4.3.
     """
 
-    version = "fast 1"
+    version = f"fast {RENDERER_VERSIONS['fast']}"
 
     def __init__(self, config: FastConfig | None = None) -> None:
         self.config = config or FastConfig()

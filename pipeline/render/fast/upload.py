@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry import Floats
+from pipeline.render.exposure import to_linear
 from pipeline.render.fast.context import MAX_COLOURS, context, give_texture, program, take_texture
-from pipeline.render.fast.geometry import Geometry, linear, occluder_faces
+from pipeline.render.fast.geometry import Geometry, occluder_faces
 from pipeline.render.fast.light import CASTERS, DIRECTIONS, KEYS, Lights, frame_of, lights_of
 from pipeline.render.scene import Ground, Scene
 
@@ -118,7 +119,7 @@ class SceneOnDevice:
     def _set_surface(self, scene: Scene) -> None:
         surface = scene.surface
         colours = np.zeros((MAX_COLOURS, 3))
-        given = linear(np.clip(np.asarray(surface.colours, np.float64), 0, 1))[:MAX_COLOURS]
+        given = to_linear(np.clip(np.asarray(surface.colours, np.float64), 0, 1))[:MAX_COLOURS]
         colours[: len(given)] = given
         self._values |= {
             "palette": colours,
@@ -308,6 +309,6 @@ def _padded(numbers: NDArray[np.intp]) -> NDArray[np.int32]:
     return out
 
 
-_LINEAR = np.rint(65535 * linear(np.arange(256) / 255)).astype(np.uint16)
-_ROOTS_OF_SRGB = np.rint(255 * np.sqrt(linear(np.arange(256) / 255))).astype(np.uint8)
+_LINEAR = np.rint(65535 * to_linear(np.arange(256) / 255)).astype(np.uint16)
+_ROOTS_OF_SRGB = np.rint(255 * np.sqrt(to_linear(np.arange(256) / 255))).astype(np.uint8)
 _ROOTS = np.rint(255 * np.sqrt((np.arange(4096) + 0.5) / 4096)).astype(np.uint8)

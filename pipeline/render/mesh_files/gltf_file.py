@@ -220,12 +220,5 @@ class GltfFile:
         return self._pictures[index]
 
 
-def uris(value: Json) -> list[str]:
-    """Files that the JSON of a glTF file names: buffers and images."""
-    entries = [entry for kind in ("buffers", "images") for entry in value.get(kind) or [] if isinstance(entry, dict)]
-    named = [entry["uri"] for entry in entries if isinstance(entry.get("uri"), str)]
-    return [unquote(uri) for uri in named if not uri.startswith("data:")]
-
-
 def _object(value: Any) -> Json:
     return value if isinstance(value, dict) else {}

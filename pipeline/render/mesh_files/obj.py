@@ -27,7 +27,9 @@ from pipeline.render.mesh_files.text import (
 from pipeline.render.mesh_files.triangulate import triangulate
 from pipeline.render.scene import Part
 
-LIBRARY = re.compile(rb"^[ \t]*mtllib[ \t]+(.+?)[ \t]*\r?$", re.MULTILINE)
+LIBRARY = re.compile(rb"^[ \t]*mtllib[ \t]([^\r\n]*)", re.MULTILINE)
+LARGEST_LIBRARY = 1 << 24
+"""Bytes; some hundred thousand materials."""
 MAP_OPTIONS = {"-blendu": 1, "-blendv": 1, "-boost": 1, "-cc": 1, "-clamp": 1, "-imfchan": 1, "-texres": 1, "-type": 1,
                "-bm": 1, "-mm": 2, "-o": 3, "-s": 3, "-t": 3}  # fmt: skip
 """Options before the file's name in `map_Kd`, and how many words follow each (at most, for -o, -s, -t)."""
@@ -267,7 +269,9 @@ def read_materials(path: Path, data: bytes) -> dict[str, Material]:
 def library_names(path: Path, data: bytes | mmap) -> Iterator[str]:
     """The material libraries that an OBJ file names."""
     for match in LIBRARY.finditer(data):
-        whole = match[1].decode(errors="surrogateescape")
+        whole = match[1].decode(errors="surrogateescape").strip(" \t")
+        if not whole:
+            continue
         try:
             single = len(whole.split()) < 2 or beside(path, whole).is_file()
         except (BadInput, OSError):
@@ -278,6 +282,9 @@ def library_names(path: Path, data: bytes | mmap) -> Iterator[str]:
 def read_library(path: Path) -> dict[str, Material]:
     """The materials of an MTL file. Raises `BadInput` where it cannot be read."""
     try:
+        if (size := path.stat().st_size) > LARGEST_LIBRARY:
+            what = f"is huge for a library of materials ({size >> 20} MiB, at most {LARGEST_LIBRARY >> 20})"
+            raise BadInput(what, where=path, remedy="Is it the file that the mesh means?")
         text = path.read_bytes().decode(errors="surrogateescape")
     except OSError as error:
         raise BadInput(f"cannot be read ({error.strerror})", where=path) from error

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import json
 import mmap
+import re
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
+from urllib.parse import unquote
 
 from dope.common.errors import BadInput
 from pipeline.ply import LONGEST_HEADER
 from pipeline.render.mesh_files.beside import beside
-from pipeline.render.mesh_files.gltf_file import uris
 from pipeline.render.mesh_files.obj import library_names, read_library
 from pipeline.render.mesh_files.ply import read_header
 
-LONGEST_JSON = 1 << 28
+URI = re.compile(rb'"uri"\s*:\s*"((?!data:)(?:[^"\\]|\\.){0,8192})"')
+"""A name in glTF's JSON, as it is written there."""
 
 
 def references(mesh: Path) -> list[tuple[str, Path | None]]:
@@ -57,16 +60,16 @@ def _ply(mesh: Path) -> list[str]:
         return []
 
 
-def _gltf(mesh: Path) -> list[str]:
-    with mesh.open("rb") as file:
-        head = file.read(20)
-        if head[:4] == b"glTF" and len(head) == 20:
-            (size,) = struct.unpack_from("<I", head, 12)
-            text = file.read(min(size, LONGEST_JSON))
-        else:
-            text = head + file.read(LONGEST_JSON)
-    try:
-        value = json.loads(text)
-        return uris(value) if isinstance(value, dict) else []
-    except (ValueError, RecursionError, TypeError):
-        return []
+def _gltf(mesh: Path) -> Iterator[str]:
+    """By its text: JSON of some size takes thirty times the memory when it is read, and this process has no limit."""
+    if not mesh.stat().st_size:
+        return
+    with mesh.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        start, end = 0, len(data)
+        if data[:4] == b"glTF" and end >= 20:
+            (size,) = struct.unpack_from("<I", data, 12)
+            start, end = 20, min(20 + size, end)
+        texts = [match[1] for match in URI.finditer(data, start, end)]
+    for text in texts:
+        with suppress(ValueError):
+            yield unquote(json.loads(b'"' + text + b'"'))

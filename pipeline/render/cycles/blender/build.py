@@ -75,6 +75,8 @@ def triangle_mesh(name: str, vertices: Any, faces: Any) -> Any:
 def part_mesh(name: str, arrays: dict[str, Any]) -> Any:
     """Triangles with what the file gives for their vertices."""
     faces = arrays["faces"]
+    if "normals" in arrays:
+        faces = wound_by_normals(arrays["vertices"], faces, arrays["normals"])
     mesh = triangle_mesh(name, arrays["vertices"], faces)
     if "uv" in arrays:
         layer = mesh.uv_layers.new(name="uv")
@@ -89,6 +91,15 @@ def part_mesh(name: str, arrays: dict[str, Any]) -> Any:
     if smooth:
         mesh.normals_split_custom_set(corner_normals(arrays["vertices"], faces, arrays["normals"]))
     return mesh
+
+
+def wound_by_normals(vertices: Any, faces: Any, normals: Any) -> Any:
+    """Faces (F, 3), turned over where most of their corners' normals look to their back: Blender shades neighbours
+    that are wound against each other black where they share a normal."""
+    corners = vertices[faces]
+    outwards = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    inwards = np.einsum("fi,fi->f", normals[faces].sum(axis=1), outwards) < 0
+    return np.where(inwards[:, None], faces[:, ::-1], faces)
 
 
 def corner_normals(vertices: Any, faces: Any, normals: Any) -> Any:

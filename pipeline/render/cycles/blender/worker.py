@@ -36,6 +36,8 @@ def limit_process(parent: int, memory: int) -> None:
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
         if os.getppid() != parent:
             os._exit(1)  # it died before this was asked for
+    above = resource.getrlimit(resource.RLIMIT_DATA)[1]  # the parent's, which only root may raise
+    memory = memory if above == resource.RLIM_INFINITY else min(memory, above)
     resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
