@@ -30,7 +30,7 @@ class ViewIndex:
         labels: (N,) int64, places in `classes`.
         classes: sorted names of the categories, of all splits: the same numbers in training and in validation.
         objects: (N,) int64, the place of the view's sequence in the sorted list of all sequences.
-        fingerprint: of the contents of the shards and of the choice of classes.
+        fingerprint: of the contents of the shards, of the choice of classes and of the labels.
         left_out: views of the split without a category.
     """
 
@@ -66,8 +66,10 @@ def read_view_index(shards: Shards, split: str, categories: Sequence[str] = ()) 
     storage = open_storage(shards)
     there = storage.sizes()
     manifest = read_manifest(storage, there)
-    table, _ = read_table(storage, "views.parquet", COLUMNS, may_be_null=("category",))
-    where = storage.where("views.parquet")
+    table, digest = read_table(storage, "views.parquet", COLUMNS, may_be_null=("category",))
+    where, tables = storage.where("views.parquet"), storage.read_json("dataset.json").get("tables")
+    if isinstance(tables, dict) and tables.get("views.parquet", digest) != digest:
+        raise BadInput("is not the one of dataset.json", where=where, remedy=REMAKE)
     try:
         columns = {name: np.array(table[name].to_pylist(), object) for name in COLUMNS}
         names = np.array([name or "" for name in columns["category"]], str)
@@ -93,7 +95,9 @@ def read_view_index(shards: Shards, split: str, categories: Sequence[str] = ()) 
         if expected is not None and there[name] != expected:
             what = f"is not the shard of dataset.json: {there[name]:,} bytes instead of {expected:,}"
             raise BadInput(what, where=storage.where(name), remedy=REMAKE)
-    hashes = [{name: manifest[name]["sha256"] for name in used}, classes]
+    labels = np.searchsorted(classes, names[rows]).astype(np.int64)
+    # the same photos may have been given other classes
+    hashes = [{name: manifest[name]["sha256"] for name in used}, classes, hashlib.sha256(labels.tobytes()).hexdigest()]
     return ViewIndex(
         storage=storage,
         keys=columns["key"][rows].astype(str),
@@ -101,7 +105,7 @@ def read_view_index(shards: Shards, split: str, categories: Sequence[str] = ()) 
         sequences=sequences[rows],
         offsets=offsets[rows],
         sizes=sizes[rows],
-        labels=np.searchsorted(classes, names[rows]).astype(np.int64),
+        labels=labels,
         classes=tuple(classes),
         objects=np.searchsorted(np.unique(sequences), sequences[rows]).astype(np.int64),
         fingerprint=hashlib.sha256(json.dumps(hashes, sort_keys=True).encode()).hexdigest()[:16],

@@ -169,7 +169,8 @@ class Method(ABC):
         """Float images (B, 3, H, W) of held-out batches, for the BatchNorm statistics of random weights."""
         for batch in batches:
             images = batch.images1 if hasattr(batch, "images1") else batch.images
-            yield images.float() / 255
+            # one small image alone may have a single value a channel, of which there are no statistics
+            yield (images if len(images) > 1 else torch.cat([images, images])).float() / 255
 
     @abstractmethod
     def validate(self, network: nn.Module, held_out: list[Any], ranks: Ranks) -> dict[str, Any]:
