@@ -32,7 +32,12 @@ def study(
     preset: Annotated[str, typer.Option(help="Of all runs, see `dope train`.")] = "nano",
     set_: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="A setting of all runs; repeatable.", show_default=False),
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="A setting of all runs, or NAME:KEY=VALUE of one line's; repeatable.",
+            show_default=False,
+        ),
     ] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Runs of each, with seeds of their own.")] = 1,
     ways: Annotated[list[int] | None, typer.Option(help="Classes an episode.  [default: 5 10]")] = None,

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from dope.common import files
 from dope.common.errors import UsageError
-from dope.study.variants import Source, Variant
+from dope.study.variants import KINDS, Source, Variant
 
 Say = Callable[[str], None]
 DOPE = (sys.executable, "-c", "from cli import main; main()")
@@ -35,7 +35,7 @@ class StudyConfig:
     preset: str = "nano"
     """`dope train --preset`."""
     settings: tuple[str, ...] = ()
-    """`dope train --set`, for all."""
+    """`dope train --set`, for all; `NAME:key=value` for the runs of one variant."""
     base: tuple[str, ...] = ()
     """Classes that the labelled variants learn; none given: all."""
     evaluation: tuple[str, ...] = ()
@@ -74,6 +74,9 @@ def pieces_of(variants: Sequence[Variant], config: StudyConfig, out: Path) -> li
     Raises:
         UsageError: a variant has no shards to train on.
     """
+    names = {name for name, _ in map(_name_and_setting, config.settings) if name is not None}
+    if unknown := names - {variant.name for kind in KINDS.values() for variant in kind}:
+        raise UsageError(f"there is no '{min(unknown)}' to give settings to", where="--set")
     for variant in variants:
         if variant.source not in config.shards:
             flag = {"labelled": "--labelled", "predicted": "--predicted-masks"}.get(variant.source, "SHARDS")
@@ -129,7 +132,7 @@ def _do(piece: Piece, config: StudyConfig, out: Path, outcome: Outcome, say: Say
 def commands(piece: Piece, config: StudyConfig, out: Path) -> Iterator[tuple[str, tuple[str, ...]]]:
     """What a run is made by: arguments of `dope`."""
     variant = piece.variant
-    settings = [f"seed={12345 + piece.seed}", *config.settings, *variant.settings]
+    settings = [f"seed={12345 + piece.seed}", *_own(config.settings, variant.name), *variant.settings]
     if variant.source == "labelled" and config.base:
         settings.append(f"data.categories={json.dumps(list(config.base))}")
     if variant.starts_from is not None:
@@ -139,6 +142,18 @@ def commands(piece: Piece, config: StudyConfig, out: Path) -> Iterator[tuple[str
     training = ("train", shards, "--out", str(piece.run), "--method", variant.method, "--preset", config.preset)
     yield "training", (*training, *options)
     yield "evaluation", ("eval", str(piece.run), config.test, *config.evaluation)
+
+
+def _own(settings: Sequence[str], name: str) -> Iterator[str]:
+    """The settings of all variants, then those of this one, which win."""
+    named = [_name_and_setting(text) for text in settings]
+    yield from (setting for whose, setting in named if whose is None)
+    yield from (setting for whose, setting in named if whose == name)
+
+
+def _name_and_setting(text: str) -> tuple[str | None, str]:
+    name, colon, setting = text.partition(":")
+    return (name, setting) if colon and "=" not in name else (None, text)
 
 
 def _call(command: tuple[str, ...], log: Path, config: StudyConfig) -> str | None:

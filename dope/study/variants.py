@@ -30,7 +30,7 @@ class Variant:
 METHODS: tuple[Variant, ...] = (
     Variant("simpleshot", "SimpleShot", "simpleshot", source="labelled"),
     Variant("rfs", "RFS", "rfs", source="labelled"),
-    Variant("feat", "FEAT", "feat", source="labelled", starts_from="simpleshot"),
+    Variant("feat", "FEAT", "feat", ("data.batch_size=1",), "labelled", "simpleshot"),  # it counts episodes
     Variant("supmoco", "SupMoCo", "supmoco", source="labelled"),
     Variant("vispe", "VISPE", "vispe"),
     Variant("vispe_simsiam", "VISPE++ SimSiam", "vispe_simsiam"),

@@ -63,10 +63,17 @@ def test_commands_say_all_that_a_run_is(tmp_path: Path) -> None:
     assert train[4:8] == ("--method", "feat", "--preset", "nano")
     settings = [b for a, b in itertools.pairwise(train) if a == "--set"]
     assert settings == [
-        "seed=12346", "data.image_size=32", 'data.categories=["cup", "mug"]',
+        "seed=12346", "data.image_size=32", "data.batch_size=1", 'data.categories=["cup", "mug"]',
         f"feat.start={tmp_path / 'runs' / 'simpleshot-seed1'}",
     ]  # fmt: skip
     assert evaluation == ("eval", str(tmp_path / "runs" / "feat-seed1"), "test")
+    own = replace(CONFIG, settings=("feat:schedule.max_steps=9", "schedule.max_steps=5", "dope:loss.chunk=64"))
+    settings = [
+        b for a, b in itertools.pairwise(next(commands(pieces["feat-seed0"], own, tmp_path))[1]) if a == "--set"
+    ]
+    assert settings[:3] == ["seed=12345", "schedule.max_steps=5", "schedule.max_steps=9"]  # the last one wins
+    with pytest.raises(UsageError, match="no 'feet' to give settings to"):
+        pieces_of(METHODS, replace(CONFIG, settings=("feet:schedule.max_steps=9",)), tmp_path)
     unlabelled = next(commands(pieces["dope-seed0"], CONFIG, tmp_path))[1]
     assert unlabelled[1] == "renders" and not any("categories" in part for part in unlabelled)
 
