@@ -16,7 +16,7 @@ def figure(
     out: Annotated[Path, typer.Option("--out", help="Folder for the PNG files.")] = Path("figures"),
     kind: Annotated[str, typer.Option(help="colouring: the same parts in the same colours; heatmap.")] = "colouring",
     sequence: Annotated[
-        list[str] | None, typer.Option(help="Which objects; repeatable.  [default: the first few]", show_default=False)
+        list[str] | None, typer.Option(help="Which objects; repeatable.", show_default="the first few")
     ] = None,
     views: Annotated[int, typer.Option(help="Views of an object.")] = 6,
     limit: Annotated[int, typer.Option(help="Objects, where none is named.")] = 3,
@@ -26,7 +26,7 @@ def figure(
     ] = "position",
     point: Annotated[
         tuple[float, float] | None,
-        typer.Option(help="heatmap: x y in pixels of the first view.  [default: the object's middle]"),
+        typer.Option(help="heatmap: x y in pixels of the first view.", show_default="the object's middle"),
     ] = None,
     device: Device = "auto",
 ) -> None:

@@ -48,7 +48,7 @@ def train(
     ] = None,
     max_bad_samples: Annotated[
         int | None,
-        typer.Option(min=0, help="Damaged samples to put up with.  [default: 0]", show_default=False),
+        typer.Option(min=0, help="Damaged samples to put up with.", show_default="0"),
     ] = None,
     verify_shards: Annotated[
         bool,
