@@ -9,10 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tiny_results import row
 
 from dope.common.errors import UsageError
+from dope.lowshot.results import append_rows
 from dope.study import run as study
 from dope.study.run import Piece, StudyConfig, commands, pieces_of, run_study
+from dope.study.table import study_table
 from dope.study.variants import ABLATIONS, KINDS, METHODS
 
 SHARDS: dict[Any, str] = {"pairs": "renders", "labelled": "classes", "predicted": "guessed"}
@@ -140,3 +143,24 @@ def test_a_command_that_fails_is_quoted_from_its_log(tmp_path: Path) -> None:
     assert why is not None and "exit code 1" in why and "no such folder" in why
     log = (piece.run / "log.txt").read_text()
     assert log.startswith(f"\n$ dope train {tmp_path / 'none'}") and json.dumps("error:")[1:-1] in log
+
+
+def test_the_table_has_means_over_seeds_and_how_they_differ(tmp_path: Path) -> None:
+    pieces = pieces_of(ABLATIONS[:2], CONFIG, tmp_path)
+    accuracies = {"dope-seed0": 0.60, "dope-seed1": 0.64, "other_objects-seed0": 0.5, "other_objects-seed1": 0.5}
+    for piece in pieces:
+        rows = [
+            row(run=piece.name, ways=ways, shots=1, accuracy=accuracies[piece.name] - (ways - 5) / 100, ci95=0.01)
+            for ways in (5, 10)
+        ]
+        append_rows(piece.run / "eval" / "results.parquet", rows)
+    text = study_table(pieces, tmp_path)
+    assert (tmp_path / "table.md").read_text() == text
+    lines = text.splitlines()
+    assert lines[0] == "|  | classifier | 5w1s | 10w1s |"
+    assert lines[2] == "| DOPE (2nd view + other objects) | local | 62.0 ± 1.0 (2.8) | 57.0 ± 1.0 (2.8) |"
+    assert lines[3] == "| other objects only | local | 50.0 ± 1.0 (0.0) | 45.0 ± 1.0 (0.0) |"
+    assert lines[4] == "| chance |  | 20.0 | 10.0 |" and "means over 2 seeds" in text
+    append_rows(pieces[0].run / "eval" / "results.parquet", [row(run="dope-seed0", ways=5, shots=5, episodes=7)])
+    with pytest.raises(UsageError, match="episodes"):
+        study_table(pieces, tmp_path)
