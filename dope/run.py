@@ -110,8 +110,10 @@ class Run:
             "resumed_at": self.state.step,
         }
 
-    def after_step(self, report: dict[str, float], meter: Meter, log: RunLog | SilentLog, *, stopping: bool) -> None:
-        """What is due after a step: progress, a line of metrics, validation, a checkpoint."""
+    def after_step(
+        self, report: dict[str, float], meter: Meter, log: RunLog | SilentLog, *, stopping: bool, hurry: bool = False
+    ) -> None:
+        """What is due after a step: progress, a line of metrics, validation, a checkpoint; `hurry` as for `save`."""
         step, policy = self.state.step, self.config.checkpoint
         log.progress(step, meter)
         if stopping or step % self.config.log.every == 0:
@@ -121,7 +123,7 @@ class Run:
         if step == self.total_steps or self.is_due(self.config.validation.every):
             is_best = self.validate(log) and policy.keep_best
         if stopping or is_best or self.is_due(policy.every, policy.every_steps):
-            self.save(log, is_best=is_best)
+            self.save(log, is_best=is_best, hurry=hurry and step < self.total_steps)
 
     def validate(self, log: RunLog | SilentLog) -> bool:
         """The method's score on all ranks' held-out samples, logged, drawn and kept for the checkpoint.
@@ -154,12 +156,12 @@ class Run:
                 log.picture("validation/pairs", step, sheet)
         return result[self.method.score] > checkpoints.best_score(self.out, before=step)
 
-    def save(self, log: RunLog | SilentLog, *, is_best: bool = False) -> None:
-        """Write a checkpoint on the first rank."""
+    def save(self, log: RunLog | SilentLog, *, is_best: bool = False, hurry: bool = False) -> None:
+        """Write a checkpoint on the first rank; with `hurry`, as after a signal, without what takes minutes."""
         if self.ranks.is_first:
             best = self.state.validation[self.method.score] if is_best and self.state.validation else None
             fingerprint = self.dataset.index.fingerprint
-            self.method.before_save(self.state.network, self.dataset)
+            self.method.before_save(self.state.network, self.dataset, hurry=hurry)
             path = checkpoints.save_checkpoint(self.out, self.state, self.method, fingerprint, best=best)
             log.event("checkpoint", self.state.step, self.state.place.epoch, {"file": path.name, "best": is_best})
 

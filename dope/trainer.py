@@ -94,7 +94,7 @@ def train(
                     log.event("memory", state.step, state.place.epoch, memory.report())
                 meter.add(config.data.batch_size, report["loss"])
                 profiler.step()
-                run.after_step(report, meter, log, stopping=stopping)
+                run.after_step(report, meter, log, stopping=stopping, hurry=asked_to_stop)
                 if stopping:
                     break
             return run.end(meter, log)

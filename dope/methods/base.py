@@ -176,8 +176,14 @@ class Method(ABC):
     def validate(self, network: nn.Module, held_out: list[Any], ranks: Ranks) -> dict[str, Any]:
         """`score` on held-out samples, and `pairs`, how many they are; the network's mode is restored."""
 
-    def before_save(self, network: nn.Module, dataset: Any) -> None:  # noqa: B027 - most methods have nothing to do
-        """What a checkpoint must hold that training itself does not need."""
+    def before_save(  # noqa: B027 - most methods have nothing to do
+        self, network: nn.Module, dataset: Any, *, hurry: bool = False
+    ) -> None:
+        """What a checkpoint must hold that training itself does not need.
+
+        Args:
+            hurry: a signal has stopped the run, which may be killed soon: leave out what takes long, and mark it.
+        """
 
     @abstractmethod
     def embedder(self, network: nn.Module) -> Embedder:

@@ -129,8 +129,10 @@ class Feat(Method):
 
     def start(self, network: nn.Module) -> None:
         assert isinstance(network, FeatNetwork)
-        if self.config.feat.start:
-            take_encoder(network, Path(self.config.feat.start), self.config.network.width)
+        if not self.config.feat.start:
+            logger.warning("feat.start names no run of SimpleShot or RFS: the encoder begins with random weights")
+            return
+        take_encoder(network, Path(self.config.feat.start), self.config.network.width)
 
     def online(self, network: nn.Module) -> OnlineFeat:
         assert isinstance(network, FeatNetwork)

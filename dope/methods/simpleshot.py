@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from dope.common.errors import UsageError
 from dope.common.progress import Progress, progress_lines
 from dope.methods.base import Facts
 from dope.methods.pooled import PooledEmbedder
@@ -28,7 +29,7 @@ logger = logging.getLogger(__name__)
 
 class SimpleShotNetwork(ClassifierNetwork):
     """The classifier, and `mean` (dim,): the mean feature of all base training images, in checkpoints that of their own
-    weights. Zero before the first one."""
+    weights. Zero before the first one; NaN in a checkpoint that a signal asked for, as it takes all images to make."""
 
     mean: Tensor
 
@@ -49,10 +50,14 @@ class SimpleShot(Supervised):
     def new_network(self, facts: Facts) -> SimpleShotNetwork:
         return SimpleShotNetwork(self.config.network.width, len(facts["classes"]))
 
-    def before_save(self, network: nn.Module, dataset: ViewDataset) -> None:
+    def before_save(self, network: nn.Module, dataset: ViewDataset, *, hurry: bool = False) -> None:
         assert isinstance(network, SimpleShotNetwork)
         now = digest(network.encoder)
         if now == self._mean_is_of:
+            return
+        if hurry:
+            network.mean.fill_(torch.nan)
+            self._mean_is_of = ""
             return
         data = self.config.data
         network.mean.copy_(
@@ -85,7 +90,15 @@ class SimpleShotEmbedder(PooledEmbedder):
         self.mean, self.transform = network.mean, transform
 
     def classify(self, vectors: NDArray[np.float32], episodes: Episodes) -> Indices:
-        return nearest_mean(vectors, episodes, self.transform, self.mean.cpu().numpy())
+        """Raises `UsageError` where the checkpoint has no mean and the transform needs it."""
+        mean = self.mean.cpu().numpy()
+        if self.transform == "cl2n" and not np.isfinite(mean).all():
+            raise UsageError(
+                "this checkpoint has no mean feature of the base images: a signal stopped the run before it was made",
+                where="--classifier cl2n",
+                remedy="Go on with the run (`dope train`, the same command), or use --classifier centroid",
+            )
+        return nearest_mean(vectors, episodes, self.transform, mean)
 
 
 def nearest_mean(

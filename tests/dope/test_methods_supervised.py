@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import shutil
+import signal
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -178,6 +180,32 @@ def test_before_a_checkpoint_the_mean_is_that_of_its_weights_and_made_once(
         next(iter(network.encoder.parameters())).mul_(1.5)
     method.before_save(network, dataset)
     assert len(calls) == 2 * times and not torch.allclose(network.mean, first)
+
+
+def test_a_signal_does_not_wait_for_the_mean_and_no_other_is_taken_for_it(
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, config = SimpleShot.losses, tiny("validation.every=0", "checkpoint.every=1")
+
+    def signalled(*arguments: Any, step: int, **options: Any) -> Any:
+        if step == 2:  # the checkpoint of step 2 has a mean of its own
+            os.kill(os.getpid(), signal.SIGTERM)
+        return real(*arguments, step=step, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SimpleShot, "losses", signalled)
+        assert train(shards, tmp_path, config)["step"] == 3
+    embedder, _ = load_embedder(tmp_path)
+    assert isinstance(embedder, SimpleShotEmbedder) and bool(embedder.mean.isnan().all())
+    drawn, vectors = episodes_of([[[0], [1]]], [[[2], [3]]]), np.ones((4, 64), np.float32)
+    with pytest.raises(UsageError, match=r"--classifier cl2n: .*no mean feature.*Go on with the run"):
+        embedder.classify(vectors, drawn)
+    assert embedder.pooled(torch.rand(1, 3, 32, 32)).isfinite().all()
+    embedder.transform = "l2n"
+    assert embedder.classify(vectors, drawn).shape == (1, 2, 1)  # which needs none
+    train(shards, tmp_path, config)
+    embedder, _ = load_embedder(tmp_path)
+    assert isinstance(embedder, SimpleShotEmbedder) and bool(embedder.mean.isfinite().all())
 
 
 def test_damaged_views_are_left_out_of_the_mean_and_said_to_be(copy: Path, caplog: pytest.LogCaptureFixture) -> None:
