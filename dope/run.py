@@ -215,6 +215,8 @@ def open_run(shards: Shards, out: Path, config: TrainConfig, ranks: Ranks, resum
         if len(set(ranks.collect(state.step))) > 1:
             what = "the ranks do not see the same checkpoints"
             raise DopeError(what, where=out / "checkpoints", remedy="All machines must share this folder")
+        if found is None:
+            method.start(state.network)
         if ranks.is_first:
             checkpoints.note_origin(resume, out, found)
         yield Run(out, config, ranks, method, dataset, order, held_out, held_out_damaged, state, found, damaged)

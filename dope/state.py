@@ -49,7 +49,6 @@ def new_state(method: Method, ranks: Ranks, facts: Facts | None = None) -> Train
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derive_seed(config.seed, "weights"))
         network = method.new_network(facts or {})
-    method.start(network)
     if config.distributed.sync_batchnorm and ranks.world > 1:
         network = synchronise_batchnorm(network, ranks.device)
     layout = torch.channels_last if config.channels_last else torch.contiguous_format

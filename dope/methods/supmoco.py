@@ -55,6 +55,9 @@ class SupMoCo(Method):
         choice = ClassKeys(dataset.index.labels, dataset.index.objects)
         return KeyedOrder(pair_order(self.config, dataset), choice, self.config.supmoco.keys, self.config.seed)
 
+    def facts(self, dataset: ViewDataset) -> Facts:
+        return {"classes": list(dataset.classes)}
+
     def new_network(self, facts: Facts) -> ContrastNetwork:
         return ContrastNetwork(self.config.network.width, (None, self.config.supmoco.head))
 

@@ -151,6 +151,15 @@ def test_stopping_within_an_epoch_and_going_on_is_bitwise_the_same(shards: Path,
     assert lines[0] == lines[1] and len(lines[0]) == 6
 
 
+def begun(config: TrainConfig) -> FeatNetwork:
+    """The network of a run before its first step."""
+    method = method_of(config)
+    network = new_state(method, ALONE).network
+    method.start(network)
+    assert isinstance(network, FeatNetwork)
+    return network
+
+
 def test_it_starts_with_the_encoder_of_simpleshot_or_rfs(shards: Path, tmp_path: Path) -> None:
     supervised = ("network.width=0.125", "data.image_size=32", "data.batch_size=4", "data.workers=0", "device=cpu")
     for method in ("simpleshot", "rfs"):
@@ -158,29 +167,29 @@ def test_it_starts_with_the_encoder_of_simpleshot_or_rfs(shards: Path, tmp_path:
         train(shards, tmp_path / method, config, stop_after=2)
         theirs = load_method(tmp_path / method)[1].encoder.state_dict()  # type: ignore[union-attr]
         config = tiny(f"feat.start={tmp_path / method}", "validation.every=0")
-        state = new_state(method_of(config), ALONE)
-        assert isinstance(state.network, FeatNetwork)
-        ours = state.network.encoder.state_dict()
+        ours = begun(config).encoder.state_dict()
         assert ours.keys() == theirs.keys() and all(torch.equal(ours[key], theirs[key]) for key in ours)
         assert any("running_mean" in key and bool(value.any()) for key, value in ours.items())
     result = train(shards, tmp_path / "feat", config, stop_after=1)
     assert load_method(Path(result["checkpoint"]))[0].name == "feat"
+    shutil.rmtree(tmp_path / "rfs")  # what it began with is needed only once
+    assert train(shards, tmp_path / "feat", config, stop_after=1)["step"] == 2
 
 
 def test_what_it_cannot_start_with_is_refused(shards: Path, tmp_path: Path) -> None:
     train(shards, tmp_path / "feat", tiny("validation.every=0"), stop_after=1)
     with pytest.raises(UsageError, match=r"feat\.start=.*step-00000001\.pt: is of method feat.*--method simpleshot"):
-        new_state(method_of(tiny(f"feat.start={tmp_path / 'feat'}")), ALONE)
+        begun(tiny(f"feat.start={tmp_path / 'feat'}"))
     settings = ("data.image_size=32", "data.batch_size=4", "data.workers=0", "device=cpu", "validation.every=0")
     wide = load_config("nano", None, [*settings, "network.width=0.25"], method="simpleshot")
     train(shards, tmp_path / "wide", wide, stop_after=1)
     with pytest.raises(UsageError, match=r"network\.width 0\.25, this run 0\.125.*--set network\.width=0\.25"):
-        new_state(method_of(tiny(f"feat.start={tmp_path / 'wide'}")), ALONE)
+        begun(tiny(f"feat.start={tmp_path / 'wide'}"))
     with pytest.raises(BadInput, match="nowhere: no such file or folder"):
         train(shards, tmp_path / "new", tiny(f"feat.start={tmp_path / 'nowhere'}"))
     (tmp_path / "bad.pt").write_bytes(b"no checkpoint")
     with pytest.raises(BadInput, match=r"bad\.pt"):
-        new_state(method_of(tiny(f"feat.start={tmp_path / 'bad.pt'}")), ALONE)
+        begun(tiny(f"feat.start={tmp_path / 'bad.pt'}"))
 
 
 def test_shards_without_classes_are_refused(tmp_path: Path) -> None:
