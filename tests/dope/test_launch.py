@@ -68,6 +68,8 @@ def test_ranks_that_are_asked_to_stop_have_the_time_they_need(
 ) -> None:
     monkeypatch.setattr(launching, "GRACE_S", 0.2)
     before = signal.getsignal(number)
+    if before == signal.SIG_IGN:
+        pytest.skip("these tests run under nohup, whose wish is heeded")
     signal_when(tmp_path, "ready-*", number)
     assert run(tmp_path, STOPS, max_restarts=1) == 75
     assert len(list(tmp_path.glob("saved-*"))) == 2 and starts(tmp_path) == 2
