@@ -310,8 +310,9 @@ def test_a_stopped_run_ends_its_children_and_says_how_to_go_on(tmp_path: Path, s
     words = ["prep", "run", "--out", work, "--views-every", "1", "--workers", "2"]
     with subprocess.Popen(
         [sys.executable, "-m", "cli", *map(str, words)], stderr=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT,
-        text=True, start_new_session=True,
+        text=True, start_new_session=True, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     ) as process:  # fmt: skip
+        # SIGINT is ignored in what a script has put into the background, and children inherit that
         while process.poll() is None and not (at_work := list(work.glob("*/.views.*.partial"))):
             time.sleep(0.005)
         process.send_signal(signal_)
