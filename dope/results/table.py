@@ -195,7 +195,8 @@ def _reading(lines: Sequence[TableLine], n_splits: int, table: str) -> list[str]
     sentences = []
     if table:
         name = paper.table_title(table)
-        sentences.append(f"Cells are means over the {n_splits} splits of {name}, of accuracies and of intervals.")
+        if n_splits > 1:
+            sentences.append(f"Cells are means over the {n_splits} splits of {name}, of accuracies and of intervals.")
         for n in sorted({len(cell.splits) for cell in cells if cell.missing}):
             sentences.append(f"({n}/{n_splits}): {n} of {n_splits} splits only.")
     if len(lines) > 1:

@@ -3,13 +3,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from tiny_results import row
+from tiny_results import row, write_run
 
 from dope.common.errors import UsageError
 from dope.lowshot.results import ResultRow
 from dope.results import paper
 from dope.results.formats import as_latex, as_markdown, as_text
-from dope.results.sources import FoundRow
+from dope.results.sources import FoundRow, find_rows
 from dope.results.table import Cell, ResultsTable, build_table
 
 MODELNET = {"table": "modelnet40_ls", "part": "test"}
@@ -207,3 +207,8 @@ def test_text_is_aligned() -> None:
     from rich.cells import cell_len
 
     assert len(rows) == 3 and len({cell_len(line) for line in rows}) == 1
+
+
+def test_one_split_is_no_mean(tmp_path: Path) -> None:
+    found = find_rows([write_run(tmp_path / "a", row(table="mine", table_split=0, part="test"))])
+    assert not any("means over" in sentence for sentence in build_table(found).caption)
