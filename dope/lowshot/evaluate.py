@@ -25,7 +25,7 @@ from dope.lowshot.episodes import EpisodeConfig
 from dope.lowshot.matching import MatchingConfig
 from dope.lowshot.results import ResultRow
 from dope.lowshot.splits import SplitTable
-from dope.lowshot.subjects import Subject, refuse_trained_classes, subjects
+from dope.lowshot.subjects import Subject, refuse_trained_classes, subjects, trained_among
 from dope.lowshot.support_copies import SupportCopies
 from dope.lowshot.tasks import Part, Task, split_tasks
 from dope.lowshot.views import ViewShards
@@ -197,6 +197,12 @@ class Evaluation:
         if self.table is not None:
             tested = {name: task.columns["table_split"] for task in reversed(tasks) for name in task.categories}
             refuse_trained_classes(subject, self.table.name, tested)
+        elif config.protocols[0].classes == "category":
+            known = trained_among(subject, {name for task in tasks for name in task.drawn.names})
+            if known:
+                self.notes.append(
+                    f"{subject.source} learnt with the labels of {', '.join(known)}: these are not new to it"
+                )
         work = Work(
             self.views, config.matching, self.device, config.batch, config.memory_gib, config.cache, config.spill,
             config.image_size, self.progress, subject.source,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -108,16 +108,21 @@ def encoder_subject(embedder: Embedder, *, label: str, sha256: str | None, confi
     return Subject(embedder, {**columns, **weights}, source=f"--encoder {label}")
 
 
+def trained_among(subject: Subject, names: Iterable[str]) -> list[str]:
+    """Which of these categories a network was trained with the labels of, sorted."""
+    from dope.lowshot.splits import normalised
+
+    known = {normalised(name) for name in subject.trained_classes}
+    return sorted(name for name in names if normalised(name) in known)
+
+
 def refuse_trained_classes(subject: Subject, table: str, tested: Mapping[str, int]) -> None:
     """Raise `UsageError` where classes whose labels a network was trained with are tested.
 
     Args:
         tested: class, as the shards name it -> the first split that tests it.
     """
-    from dope.lowshot.splits import normalised
-
-    known = {normalised(name) for name in subject.trained_classes}
-    both = sorted(name for name in tested if normalised(name) in known)
+    both = trained_among(subject, tested)
     if both:
         what = f"was trained with the labels of {', '.join(both)}, which split {tested[both[0]]} of {table} tests"
         raise UsageError(what, where=subject.source, remedy="Train on the base classes of the table alone")

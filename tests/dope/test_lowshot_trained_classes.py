@@ -1,0 +1,42 @@
+"""Classes whose labels a network has seen are no new classes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from tiny_labelled import write_labelled
+
+from dope.checkpoints import find_checkpoint
+from dope.common.errors import UsageError
+from dope.config import load_config
+from dope.lowshot.episodes import EpisodeConfig
+from dope.lowshot.evaluate import EvaluationConfig, evaluate
+from dope.lowshot.splits import Split, SplitTable
+from dope.trainer import train
+
+SMALL = [
+    "network.width=0.125", "data.image_size=32", "data.batch_size=4", "data.pairs_per_object=1", "data.workers=0",
+    "schedule.max_steps=1", "validation.every=0", "device=cpu", 'data.categories=["bar", "disc"]',
+]  # fmt: skip
+PROTOCOL = EvaluationConfig((EpisodeConfig(ways=2, queries=2, episodes=4),))
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    names = ("bar", "disc", "ring", "square")
+    return write_labelled(tmp_path_factory.mktemp("shards"), shapes=names, objects=4, held_out=1)
+
+
+@pytest.mark.parametrize("method", ["simpleshot", "supmoco"])
+def test_trained_classes_are_told_and_in_a_table_refused(shards: Path, tmp_path: Path, method: str) -> None:
+    torch.set_num_threads(1)
+    train(shards, tmp_path, load_config("nano", None, SMALL, method=method))
+    run = find_checkpoint(tmp_path)
+    assert any("learnt with the labels of bar, disc" in note for note in evaluate(run, shards, PROTOCOL).notes)
+    new = EvaluationConfig(PROTOCOL.protocols, categories=("ring", "square"))
+    assert not any("labels" in note for note in evaluate(run, shards, new).notes)
+    leaking = SplitTable("mine", (), (Split(("ring",), ("disc", "square")),))
+    with pytest.raises(UsageError, match="was trained with the labels of disc, which split 0 of mine tests"):
+        evaluate(run, shards, PROTOCOL, table=leaking)
