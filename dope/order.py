@@ -11,9 +11,10 @@ together there), cut into blocks of neighbours; the blocks are shuffled, and a b
 from __future__ import annotations
 
 import logging
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +37,53 @@ class Place:
     consumed: int = 0
 
 
-class SampleOrder:
+class EpochOrder(ABC):
+    """Epochs of equal steps, which ranks share and which a run may go on in at any of them.
+
+    Attributes:
+        batch_size: samples (or episodes) in a step over all ranks.
+        steps_per_epoch: whole steps; what is left over is dropped.
+        unit: what `batch_size` counts, for errors.
+    """
+
+    batch_size: int
+    steps_per_epoch: int
+    unit: ClassVar[str] = "samples"
+
+    @abstractmethod
+    def epoch(self, epoch: int) -> NDArray[np.int64]:
+        """(steps_per_epoch, batch_size, ...) sample rows."""
+
+    def batches(self, start: Place, epochs: int, *, rank: int = 0, world: int = 1) -> Iterator[list[int]]:
+        """The rows of `rank`'s contiguous share of each step, from `start` to the end of `epochs`.
+
+        Raises:
+            UsageError: the batch cannot be divided by `world`.
+        """
+        if self.batch_size % world:
+            raise UsageError(
+                f"{self.batch_size} {self.unit} a step cannot be divided among {world} ranks",
+                where="data.batch_size",
+                remedy=f"Use --set data.batch_size={max(1, self.batch_size // world) * world}",
+            )
+        share = self.batch_size // world
+        return self._shares(start, epochs, slice(rank * share, (rank + 1) * share))
+
+    def after(self, place: Place) -> Place:
+        """The place one step later; `consumed` counts what `batch_size` does."""
+        consumed = place.consumed + self.batch_size
+        if consumed >= self.steps_per_epoch * self.batch_size:
+            return Place(place.epoch + 1, 0)
+        return Place(place.epoch, consumed)
+
+    def _shares(self, start: Place, epochs: int, mine: slice) -> Iterator[list[int]]:
+        for epoch in range(start.epoch, epochs):
+            first = start.consumed // self.batch_size if epoch == start.epoch else 0
+            for batch in self.epoch(epoch)[first:]:
+                yield batch[mine].ravel().tolist()
+
+
+class SampleOrder(EpochOrder):
     """Cuts epochs into batches of sample rows.
 
     Args:
@@ -105,34 +152,6 @@ class SampleOrder:
         batches = np.concatenate(rows)[:whole].reshape(self.steps_per_epoch, self.batch_size)
         # which sample of a batch is which says nothing; side by side, a rank's share is neighbours as well
         return np.sort(batches, axis=1) if self.sequential else batches
-
-    def batches(self, start: Place, epochs: int, *, rank: int = 0, world: int = 1) -> Iterator[list[int]]:
-        """The rows of `rank`'s contiguous share of each global batch, from `start` to the end of `epochs`.
-
-        Raises:
-            UsageError: the batch cannot be divided by `world`.
-        """
-        if self.batch_size % world:
-            raise UsageError(
-                f"a batch of {self.batch_size} cannot be divided among {world} ranks",
-                where="data.batch_size",
-                remedy=f"Use --set data.batch_size={max(1, self.batch_size // world) * world}",
-            )
-        share = self.batch_size // world
-        return self._shares(start, epochs, slice(rank * share, (rank + 1) * share))
-
-    def after(self, place: Place) -> Place:
-        """The place one step later."""
-        consumed = place.consumed + self.batch_size
-        if consumed >= self.steps_per_epoch * self.batch_size:
-            return Place(place.epoch + 1, 0)
-        return Place(place.epoch, consumed)
-
-    def _shares(self, start: Place, epochs: int, mine: slice) -> Iterator[list[int]]:
-        for epoch in range(start.epoch, epochs):
-            first = start.consumed // self.batch_size if epoch == start.epoch else 0
-            for batch in self.epoch(epoch)[first:]:
-                yield batch[mine].tolist()
 
     def _pair_of_round(self, number: int) -> NDArray[np.int64]:
         """(n_objects,) the sample row that each object shows in round `number`."""

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from dope.augmentation import no_augmentation
 from dope.batch import PairBatch
@@ -78,7 +78,7 @@ def mask_iou(mask_logits: Tensor, masks: Tensor) -> Tensor:
 
 
 @contextmanager
-def evaluating(network: DopeNetwork) -> Iterator[None]:
+def evaluating(network: nn.Module) -> Iterator[None]:
     """The network in eval mode; its mode is restored."""
     training = network.training
     network.eval()

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +12,7 @@ from dope.common.errors import UsageError
 from dope.common.seeds import derive_seed
 from dope.lowshot.episodes import EpisodeConfig, sample_episodes
 from dope.methods.configs import FeatConfig
-from dope.order import Place
+from dope.order import EpochOrder
 
 if TYPE_CHECKING:
     from dope.view_index import ViewIndex
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 
-class EpisodeOrder:
+class EpisodeOrder(EpochOrder):
     """Cuts epochs into steps of whole episodes.
 
     An episode draws classes, then objects without overlap between shots and queries, then one random view of each.
@@ -40,6 +39,8 @@ class EpisodeOrder:
     Raises:
         UsageError: too few classes are large enough, or an epoch has fewer episodes than a step.
     """
+
+    unit: ClassVar[str] = "episodes"
 
     def __init__(self, index: ViewIndex, batch_size: int, config: FeatConfig, seed: int) -> None:
         self.batch_size, self.config, self.seed = batch_size, config, seed
@@ -74,34 +75,6 @@ class EpisodeOrder:
         drawn = sample_episodes(self._population, protocol)
         rows = np.concatenate([drawn.support, drawn.query], axis=2)[:whole]
         return rows.reshape(self.steps_per_epoch, self.batch_size, *rows.shape[1:])
-
-    def batches(self, start: Place, epochs: int, *, rank: int = 0, world: int = 1) -> Iterator[list[int]]:
-        """The rows of `rank`'s episodes of each step, one episode after the other, from `start` to the end of `epochs`.
-
-        Raises:
-            UsageError: the episodes of a step cannot be divided by `world`.
-        """
-        if self.batch_size % world:
-            raise UsageError(
-                f"{self.batch_size} episodes a step cannot be divided among {world} ranks",
-                where="data.batch_size",
-                remedy=f"Use --set data.batch_size={max(1, self.batch_size // world) * world}",
-            )
-        share = self.batch_size // world
-        return self._shares(start, epochs, slice(rank * share, (rank + 1) * share))
-
-    def after(self, place: Place) -> Place:
-        """The place one step later; `consumed` counts episodes."""
-        consumed = place.consumed + self.batch_size
-        if consumed >= self.steps_per_epoch * self.batch_size:
-            return Place(place.epoch + 1, 0)
-        return Place(place.epoch, consumed)
-
-    def _shares(self, start: Place, epochs: int, mine: slice) -> Iterator[list[int]]:
-        for epoch in range(start.epoch, epochs):
-            first = start.consumed // self.batch_size if epoch == start.epoch else 0
-            for step in self.epoch(epoch)[first:]:
-                yield step[mine].ravel().tolist()
 
 
 def population(

@@ -173,7 +173,7 @@ class Feat(Method):
         suffice; `chance` says what guessing gives."""
         assert isinstance(network, FeatNetwork)
         device, found = next(network.parameters()).device, []
-        with evaluating(network), torch.no_grad():  # type: ignore[arg-type]
+        with evaluating(network), torch.no_grad():
             for batch in held_out:
                 vectors = network(batch.images.to(device).float() / 255).cpu().numpy()
                 found.append((vectors, batch.labels.numpy(), batch.objects.numpy(), np.array(batch.keys)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -53,13 +54,13 @@ class PairMethod(Method):
         features: Tensor = self.pooled_network(network)(images)
         return features
 
+    @abstractmethod
     def pooled_network(self, network: nn.Module) -> nn.Module:
         """The part of the network that is used after training."""
-        raise NotImplementedError
 
     def validate(self, network: nn.Module, held_out: list[PairBatch], ranks: Ranks) -> dict[str, Any]:
         device, found = next(network.parameters()).device, []
-        with evaluating(network), torch.no_grad():  # type: ignore[arg-type]
+        with evaluating(network), torch.no_grad():
             for loaded in held_out:
                 batch = no_augmentation(loaded.to(device))
                 first, second = (unit(self.features(network, images)) for images in (batch.images1, batch.images2))

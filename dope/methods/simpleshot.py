@@ -145,7 +145,7 @@ def mean_feature(
     total, counted, done = torch.zeros((), dtype=torch.float64, device=device), 0, 0
     rows = (list(range(start, min(start + batch_size, n))) for start in range(0, n, batch_size))
     loader = PairLoader(dataset, rows, workers=workers, pin_memory=device.type == "cuda", fill_damaged=True)
-    with evaluating(encoder):  # type: ignore[arg-type]
+    with evaluating(encoder):
         for loaded in loader:
             batch = loaded.without_damaged()
             done += len(loaded)

@@ -103,7 +103,7 @@ class Supervised(Method):
     def validate(self, network: nn.Module, held_out: list[ImageBatch], ranks: Ranks) -> dict[str, Any]:
         device = next(network.parameters()).device
         counts = torch.zeros(2, dtype=torch.float64, device=device)
-        with evaluating(network), torch.no_grad():  # type: ignore[arg-type]
+        with evaluating(network), torch.no_grad():
             for batch in held_out:
                 logits = network(batch.images.to(device).float() / 255)
                 _, hits, n = cross_entropy(logits, batch.labels.to(device))

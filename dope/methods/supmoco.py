@@ -105,7 +105,7 @@ class SupMoCo(Method):
     def validate(self, network: nn.Module, held_out: list[ImageBatch], ranks: Ranks) -> dict[str, Any]:
         assert isinstance(network, ContrastNetwork)
         device, found = next(network.parameters()).device, []
-        with evaluating(network), torch.no_grad():  # type: ignore[arg-type]
+        with evaluating(network), torch.no_grad():
             for batch in held_out:
                 vectors = unit(network.encoder(batch.images.to(device).float() / 255)).cpu()
                 found.append((vectors, batch.labels, batch.objects))

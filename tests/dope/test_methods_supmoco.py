@@ -115,7 +115,7 @@ def test_the_order_is_the_queries_and_then_their_keys_whatever_the_ranks(shards:
         place = order.after(place)
     assert place == Place(1, 4) and list(order.batches(place, 2)) == whole[5:]
     assert list(method.order(dataset).batches(Place(), 2)) == whole
-    with pytest.raises(UsageError, match=r"data.batch_size: a batch of 4 cannot be divided among 3 ranks"):
+    with pytest.raises(UsageError, match=r"data.batch_size: 4 samples a step cannot be divided among 3 ranks"):
         order.batches(Place(), 1, rank=0, world=3)
 
 
