@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from dope.commands.options import Shards, check_choice
+from dope.common.errors import UsageError
 from dope.study.variants import KINDS
 
 
@@ -29,6 +30,18 @@ def study(
         Path | None,
         typer.Option(help="Base classes for the supervised methods, test classes for all.", show_default=False),
     ] = None,
+    also: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--also",
+            metavar="NAME=SHARDS",
+            help="More views to test on: all their classes, the smallest --ways, `--fit`, the last step; repeatable.",
+            show_default=False,
+        ),
+    ] = None,
+    select: Annotated[
+        bool, typer.Option("--select", help="Test the checkpoint that is best on the validation classes.")
+    ] = False,
     preset: Annotated[str, typer.Option(help="Of all runs, see `dope train`.")] = "nano",
     set_: Annotated[
         list[str] | None,
@@ -55,7 +68,8 @@ def study(
 
       dope study shards --test test_shards --out study --kind ablations
 
-      dope study renders --labelled labelled --test labelled --split-file split.json --out study --seeds 3 --jobs 2
+      dope study renders --labelled labelled --test labelled --split-file split.json --select --out study \
+      --seeds 3 --jobs 2 --also photos=shards_photos
     """
     from rich.console import Console
 
@@ -68,15 +82,21 @@ def study(
         check_choice(name, "--only", tuple(variant.name for variant in variants))
     if only:
         variants = tuple(variant for variant in variants if variant.name in only)
-    evaluation = [part for way in ways or [5, 10] for part in ("--ways", str(way))]
-    evaluation += [part for shot in shots or [1, 5] for part in ("--shots", str(shot))]
-    evaluation += ["--queries", str(queries), "--episodes", str(episodes)]
+    ways = ways or [5, 10]
+    protocol = [part for shot in shots or [1, 5] for part in ("--shots", str(shot))]
+    protocol += ["--queries", str(queries), "--episodes", str(episodes)]
+    evaluation = [part for way in ways for part in ("--ways", str(way))] + protocol
     base: tuple[str, ...] = ()
     if split_file is not None:
         from dope.lowshot.splits import read_split_file
 
         base = read_split_file(split_file).base
         evaluation += ["--split-file", str(split_file)]
+    if select:
+        if split_file is None:
+            raise UsageError("needs validation classes", where="--select", remedy="Give them by --split-file")
+        evaluation += ["--select"]
+    named = dict(_name_and_shards(text) for text in also or ())
     sources = {"pairs": shards, "labelled": labelled, "predicted": predicted_masks}
     config = StudyConfig(
         {name: place for name, place in sources.items() if place is not None},  # type: ignore[misc]
@@ -85,6 +105,8 @@ def study(
         tuple(set_ or ()),
         base,
         tuple(evaluation),
+        tuple(named.items()),
+        ("--ways", str(min(ways)), *protocol, "--fit"),
         tuple(range(seeds)),
         jobs,
     )
@@ -92,6 +114,18 @@ def study(
     outcome = run_study(variants, config, out, lambda text: console.print(text, markup=False, soft_wrap=True))
     if outcome.done:
         typer.echo(study_table(outcome.done, out), nl=False)
+        for name in named:
+            typer.echo(f"\n{name}:\n\n{study_table(outcome.done, out, name)}", nl=False)
     for name, why in outcome.failed.items():
         console.print(f"{name}: {why}", markup=False, soft_wrap=True)
     raise typer.Exit(1 if outcome.failed else 0)
+
+
+def _name_and_shards(text: str) -> tuple[str, str]:
+    """Of `--also NAME=SHARDS`."""
+    name, equals, shards = text.partition("=")
+    if not equals or not shards or not name.replace("-", "").replace("_", "").isalnum():
+        raise UsageError(
+            f"'{text}' is not NAME=SHARDS", where="--also", remedy="For example --also photos=shards_photos"
+        )
+    return name, shards

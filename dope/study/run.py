@@ -14,6 +14,7 @@ from pathlib import Path
 
 from dope.common import files
 from dope.common.errors import UsageError
+from dope.results.sources import NAMES
 from dope.study.variants import KINDS, Source, Variant
 
 Say = Callable[[str], None]
@@ -40,6 +41,10 @@ class StudyConfig:
     """Classes that the labelled variants learn; none given: all."""
     evaluation: tuple[str, ...] = ()
     """Options of `dope eval`."""
+    also: tuple[tuple[str, str], ...] = ()
+    """More shards to test on, by name: all their classes, at the last step; in RUN/eval-NAME."""
+    also_evaluation: tuple[str, ...] = ()
+    """Options of `dope eval` for them."""
     seeds: tuple[int, ...] = (0,)
     """A run of each variant for each."""
     jobs: int = 1
@@ -117,7 +122,9 @@ def _do(piece: Piece, config: StudyConfig, out: Path, outcome: Outcome, say: Say
         mark = piece.run / f".{what}.json"
         if not anew and mark.is_file() and files.read_json(mark) == list(command):
             continue
-        anew = True  # another network is evaluated again
+        anew |= what == "training"  # another network is evaluated again
+        if command[0] == "eval" and mark.is_file():
+            _forget_results(Path(command[command.index("--out") + 1]) if "--out" in command else piece.run / "eval")
         say(f"{piece.name}: {what}")
         began = time.perf_counter()
         why = _call(command, piece.run / "log.txt", config)
@@ -142,6 +149,20 @@ def commands(piece: Piece, config: StudyConfig, out: Path) -> Iterator[tuple[str
     training = ("train", shards, "--out", str(piece.run), "--method", variant.method, "--preset", config.preset)
     yield "training", (*training, *options)
     yield "evaluation", ("eval", str(piece.run), config.test, *config.evaluation)
+    for name, also in config.also:
+        folder = str(piece.run / also_folder(name))
+        yield f"evaluation-{name}", ("eval", str(piece.run), also, "--out", folder, *config.also_evaluation)
+
+
+def _forget_results(folder: Path) -> None:
+    """Rows of an evaluation that is done anew by another protocol: tables would refuse the two together."""
+    for name in NAMES:
+        (folder / name).unlink(missing_ok=True)
+
+
+def also_folder(name: str) -> str:
+    """Of a run's results on the shards that `StudyConfig.also` calls so."""
+    return f"eval-{name}"
 
 
 def _own(settings: Sequence[str], name: str) -> Iterator[str]:

@@ -10,11 +10,14 @@ from dope.common import files
 from dope.results.one_protocol import check_one_protocol
 from dope.results.rows import column_name, columns_of
 from dope.results.sources import FoundRow, find_rows
-from dope.study.run import Piece
+from dope.study.run import Piece, also_folder
 
 
-def study_table(pieces: Sequence[Piece], out: Path) -> str:
+def study_table(pieces: Sequence[Piece], out: Path, also: str | None = None) -> str:
     """The table of runs that were evaluated by one protocol, in Markdown; also written to OUT/table.md.
+
+    Of `also` (`StudyConfig.also`) the results on those shards instead, written to OUT/table-NAME.md. Rows of validation
+    classes, which `dope eval --select` leaves, are no part of it.
 
     A cell is the mean accuracy in % over a table's splits and over seeds, the mean half width of the 95% confidence
     interval over episodes and, of several seeds, the standard deviation between them (in brackets).
@@ -23,7 +26,7 @@ def study_table(pieces: Sequence[Piece], out: Path) -> str:
         UsageError: the rows are of several protocols.
         BadInput: a run has no rows.
     """
-    found = {piece: find_rows([piece.run]) for piece in pieces}
+    found = {piece: _test_rows(piece.run if also is None else piece.run / also_folder(also)) for piece in pieces}
     rows = [row for rows in found.values() for row in rows]
     check_one_protocol(rows)
     columns = columns_of(rows)
@@ -47,8 +50,13 @@ def study_table(pieces: Sequence[Piece], out: Path) -> str:
     if seeds > 1:
         said += f"; means over {seeds} seeds, whose standard deviation is in brackets"
     text = "".join(f"| {' | '.join(line)} |\n" for line in lines) + f"\n{said}.\n"
-    files.write_bytes(out / "table.md", text.encode())
+    files.write_bytes(out / ("table.md" if also is None else f"table-{also}.md"), text.encode())
     return text
+
+
+def _test_rows(place: Path) -> list[FoundRow]:
+    found = find_rows([place])
+    return [item for item in found if item.row.part != "val"]
 
 
 def _of_column(run: Sequence[FoundRow], column: tuple[int, int]) -> list[FoundRow]:

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from tiny_results import row
 
+from dope.commands.study import _name_and_shards
 from dope.common.errors import UsageError
 from dope.lowshot.results import append_rows
 from dope.study import run as study
@@ -79,6 +80,43 @@ def test_commands_say_all_that_a_run_is(tmp_path: Path) -> None:
         pieces_of(METHODS, replace(CONFIG, settings=("feet:schedule.max_steps=9",)), tmp_path)
     unlabelled = next(commands(pieces["dope-seed0"], CONFIG, tmp_path))[1]
     assert unlabelled[1] == "renders" and not any("categories" in part for part in unlabelled)
+
+
+def test_more_views_are_tested_beside_and_shown_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    also = replace(CONFIG, also=(("photos", "pictures"),), also_evaluation=("--ways", "4", "--fit"), seeds=(0,))
+    (piece,) = pieces_of(ABLATIONS[:1], also, tmp_path)
+    *_, (what, command) = commands(piece, also, tmp_path)
+    folder = piece.run / "eval-photos"
+    assert what == "evaluation-photos"
+    assert command == ("eval", str(piece.run), "pictures", "--out", str(folder), "--ways", "4", "--fit")
+    append_rows(piece.run / "eval" / "results.parquet", [row(run=piece.name, ways=5, accuracy=0.9)])
+    append_rows(folder / "results.parquet", [row(run=piece.name, ways=4, accuracy=0.3)])
+    assert "| 5w" in study_table([piece], tmp_path) and "90.0" in (tmp_path / "table.md").read_text()
+    assert "| 4w" in study_table([piece], tmp_path, "photos") and "30.0" in (tmp_path / "table-photos.md").read_text()
+
+    calls = Calls()
+    monkeypatch.setattr(study, "_call", calls)
+    run_study(ABLATIONS[:1], also, tmp_path, lambda text: None)
+    assert [command[0] for command in calls.commands] == ["train", "eval", "eval"]
+    append_rows(folder / "results.parquet", [row(run=piece.name, ways=4, accuracy=0.3)])
+    other = replace(also, also_evaluation=("--ways", "3"))
+    run_study(ABLATIONS[:1], other, tmp_path, lambda text: None)
+    assert calls.commands[3:] == [("eval", str(piece.run), "pictures", "--out", str(folder), "--ways", "3")]
+    assert not (folder / "results.parquet").exists()  # rows of 4 ways and of 3 would be refused side by side
+    assert (piece.run / "eval" / "results.parquet").exists()
+
+
+def test_rows_of_validation_classes_are_not_in_the_table(tmp_path: Path) -> None:
+    pieces = pieces_of(ABLATIONS[:1], replace(CONFIG, seeds=(0,)), tmp_path)
+    rows = [row(run=pieces[0].name, part=part, accuracy=a) for part, a in (("val", 0.9), ("test", 0.4))]
+    append_rows(pieces[0].run / "eval" / "results.parquet", rows)
+    assert "40.0" in (text := study_table(pieces, tmp_path)) and "90.0" not in text and "65.0" not in text
+
+
+@pytest.mark.parametrize("text", ["photos", "=x", "photos=", "a/b=x"])
+def test_more_views_are_named(text: str) -> None:
+    with pytest.raises(UsageError, match="is not NAME=SHARDS"):
+        _name_and_shards(text)
 
 
 def test_what_others_start_from_comes_first_and_nothing_is_done_twice(
