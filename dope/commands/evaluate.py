@@ -226,13 +226,10 @@ def _check_encoder(encoder: str | None, mask: str, *, select: bool, compare_untr
 
 def _splits(table: str | None, split_file: Path | None, select: bool) -> SplitTable | None:
     """The table that --table or --split-file names."""
-    from dope.lowshot.splits import paper_table, read_split_file
+    from dope.lowshot.splits import named_table
 
-    if table is not None and split_file is not None:
-        raise UsageError("names splits, and --table does too", where="--split-file", remedy="Leave one of them out")
-    if table is None and split_file is None:
-        if select:
-            remedy = "Add --table modelnet40_ls, shapenet55_ls or co3d_ls, or --split-file FILE"
-            raise UsageError("needs splits with validation classes", where="--select", remedy=remedy)
-        return None
-    return paper_table(table) if table is not None else read_split_file(split_file) if split_file else None
+    splits = named_table(table, split_file)
+    if splits is None and select:
+        remedy = "Add --table modelnet40_ls, shapenet55_ls or co3d_ls, or --split-file FILE"
+        raise UsageError("needs splits with validation classes", where="--select", remedy=remedy)
+    return splits

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from dope.commands.options import Shards
+from dope.common.errors import UsageError
 from dope.methods import KNOWN
 from dope.preset_files import preset_names, preset_summary
+
+if TYPE_CHECKING:
+    from dope.config import TrainConfig
+    from dope.lowshot.splits import SplitTable
 
 METHODS_HELP = "What to train: " + ", ".join(KNOWN) + "; all but the first are the paper's baselines."
 PRESETS_HELP = "\n\n".join(f"{name}: {preset_summary(name)}" for name in preset_names())
@@ -27,6 +33,17 @@ def train(
     set_: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="One setting, e.g. optimiser.lr=3e-4.", show_default=False),
+    ] = None,
+    table: Annotated[
+        str | None,
+        typer.Option(
+            help="Learn only from the base classes of a table of the paper: modelnet40_ls, shapenet55_ls or co3d_ls.",
+            show_default=False,
+        ),
+    ] = None,
+    split_file: Annotated[
+        Path | None,
+        typer.Option(help="Learn only from the base classes of your own splits, see `dope eval`.", show_default=False),
     ] = None,
     resume: Annotated[
         str,
@@ -78,14 +95,19 @@ def train(
 
       dope train shards --out run --set optimiser.lr=3e-4 --set data.batch_size=64
 
+      dope train shards --out rfs --method rfs --preset paper_modelnet --table modelnet40_ls
+
       torchrun --nproc-per-node 4 $(which dope) train shards --out run
 
       dope train s3://bucket/shards --out run --set data.order=sequential
     """
     from dope.config import load_config
+    from dope.lowshot.splits import named_table
 
     overrides = [*(set_ or ()), *([] if max_bad_samples is None else [f"data.max_bad_samples={max_bad_samples}"])]
     resolved = load_config(preset, config, overrides, method=method)
+    if (splits := named_table(table, split_file)) is not None:
+        resolved = _of_base_classes(resolved, shards, splits)
     from dope.launch import as_rank, is_rank, launch
 
     if verify_shards and not is_rank() and os.environ.get("RANK", "0") == "0":
@@ -104,6 +126,19 @@ def train(
     if os.environ.get("RANK", "0") == "0":
         _print_training(result, out)
     raise typer.Exit(EXIT_STOPPED if result["status"] == "stopped" and stop_after is None else 0)
+
+
+def _of_base_classes(config: TrainConfig, shards: str, splits: SplitTable) -> TrainConfig:
+    """The settings with a table's base classes as `data.categories`."""
+    from dope.base_classes import base_categories
+
+    names = base_categories(shards, splits)
+    if config.data.categories not in ((), names):
+        remedy = "Leave out either the table or data.categories"
+        raise UsageError(
+            "the settings name other classes than these", where=f"{splits.name}, base classes", remedy=remedy
+        )
+    return replace(config, data=replace(config.data, categories=names))
 
 
 def _print_training(result: dict[str, Any], out: Path) -> None:

@@ -59,6 +59,20 @@ def paper_table(name: str) -> SplitTable:
     return read_split_file(TABLES / f"{name}.json")
 
 
+def named_table(name: str | None, split_file: Path | None) -> SplitTable | None:
+    """The table that `--table` or `--split-file` names; None where neither is given.
+
+    Raises:
+        UsageError: both are given, or no such table.
+        BadInput: see `read_split_file`.
+    """
+    if name is not None and split_file is not None:
+        raise UsageError("names splits, and --table does too", where="--split-file", remedy="Leave one of them out")
+    if name is not None:
+        return paper_table(name)
+    return None if split_file is None else read_split_file(split_file)
+
+
 def read_split_file(path: Path) -> SplitTable:
     """Read a table of splits.
 
