@@ -254,8 +254,6 @@ class Evaluation:
         config, used = self.config, task.drawn.config
         kept = ("classes", "ways", "shots", "shot_mode", "queries", "episodes", "seed")
         other: dict[str, Any] = {"categories": config.categories, "image_size": config.image_size}
-        if config.support_copies > 1:
-            other["support_copies"] = config.support_copies
         if self.table is not None:
             other["table"] = settings.config_hash(self.table)
         return {
@@ -264,6 +262,7 @@ class Evaluation:
             "asked_queries": task.asked.queries,
             "chance": task.drawn.chance,
             "classifier": classifier,
+            "support_copies": config.support_copies,
             "split": config.split,
             "evaluation_hash": settings.config_hash({**other, "matching": settings.to_dict(config.matching)}),
         }

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 OUTCOME = ("accuracy", "ci95")
+WEIGHTS = ("checkpoint", "checkpoint_sha256", "step")
+CLASSIFIERS = {"local": "local matching", "centroid": "nearest centroid", "nearest": "1-NN", "logistic": "logistic"}
+"""Their names in tables; others stay as they are."""
 
 
 @dataclass(frozen=True)
@@ -86,14 +89,26 @@ class ResultRow:
     """Which of its splits, from 0; -1 without a table."""
     part: str = "all"
     """Classes of that split: test or val; all without a table."""
+    support_copies: int = 1
+    """How often logistic regression learnt from each shot; beyond the first, augmented as in training."""
+    chosen_by: str = ""
+    """"validation": of all checkpoints of the run, the split's validation classes chose this one (`--select`)."""
 
     @property
     def protocol(self) -> str:
         return f"{self.ways}-way {self.shots}-shot"
 
+    @property
+    def classifier_in_words(self) -> str:
+        """With how it was fitted, where that is not the usual way."""
+        name = CLASSIFIERS.get(self.classifier, self.classifier)
+        return f"{name}, {self.support_copies} copies a shot" if self.support_copies > 1 else name
+
 
 def append_rows(path: Path, rows: Iterable[ResultRow]) -> list[ResultRow]:
     """Add rows to a .parquet or .json file, in order; a row measured before is replaced. Returns all rows.
+
+    A row of a chosen checkpoint replaces that of an earlier choice, whichever it was.
 
     Several processes may do so at once: each adds to what the others wrote.
 
@@ -151,9 +166,7 @@ def mean_over_splits(rows: Iterable[ResultRow]) -> list[tuple[ResultRow, int]]:
     return [(_mean(group), len(group)) for group in groups.values()]
 
 
-_PER_SPLIT = (
-    *OUTCOME, "table_split", "n_classes", "n_objects", "n_views", "checkpoint", "checkpoint_sha256", "step",
-)  # fmt: skip
+_PER_SPLIT = (*OUTCOME, *WEIGHTS, "table_split", "n_classes", "n_objects", "n_views")
 
 
 def _mean(rows: Sequence[ResultRow]) -> ResultRow:
@@ -161,8 +174,7 @@ def _mean(rows: Sequence[ResultRow]) -> ResultRow:
         return rows[0]
     means = {name: sum(getattr(row, name) for row in rows) / len(rows) for name in OUTCOME}
     least = {name: min(getattr(row, name) for row in rows) for name in ("n_classes", "n_objects", "n_views")}
-    weights = ("checkpoint", "checkpoint_sha256", "step")
-    differing: dict[str, Any] = {name: None for name in weights if len({getattr(row, name) for row in rows}) > 1}
+    differing: dict[str, Any] = {name: None for name in WEIGHTS if len({getattr(row, name) for row in rows}) > 1}
     return dataclasses.replace(rows[0], table_split=-1, **means, **least, **differing)
 
 
@@ -181,7 +193,8 @@ def results_table(rows: Sequence[ResultRow], title: str = "Low-shot recognition"
         "of": [_classes(row, count) for row, count in counted],
         "views": [f"{row.n_views} views ({row.split})" for row in rows],
         "method": [row.method if row.network == "trained" else "" for row in rows],
-        "classifier": [{"local": "local matching"}.get(row.classifier, row.classifier) for row in rows],
+        "classifier": [row.classifier_in_words for row in rows],
+        "checkpoint": ["chosen on validation classes" if row.chosen_by else "" for row in rows],
         "queries": [f"{row.queries} queries a class" for row in rows],
         "episodes": [f"{row.episodes:,} episodes" for row in rows],
     }
@@ -227,7 +240,8 @@ def _protocol(row: ResultRow) -> str:
 
 def _identity(row: ResultRow) -> tuple[Any, ...]:
     values = dataclasses.asdict(row)
-    return tuple(value for name, value in values.items() if name not in OUTCOME)
+    without = (*OUTCOME, *WEIGHTS) if row.chosen_by else OUTCOME
+    return tuple(value for name, value in values.items() if name not in without)
 
 
 def _write(path: Path, rows: Sequence[ResultRow]) -> None:

@@ -34,7 +34,7 @@ def evaluate_best(
     """Test each split of a table with the checkpoint of a run that is best on the split's validation classes.
 
     Rows: of every checkpoint on the validation classes of each split (part "val"), then the tests (part "test"), whose
-    column `checkpoint` says which one was chosen.
+    column `checkpoint` says which one was chosen, and `chosen_by` that it was.
 
     Args:
         run: a run's folder; all of its checkpoints are tried.
@@ -80,7 +80,8 @@ def evaluate_best(
             continue
         tasks = [task for task in test.tasks if task.columns["table_split"] in splits_of[path.name]]
         for subject in subjects(path, device, run=run):
-            tested += zip(*test.measure(subject, tasks), strict=True)
+            measured, values = test.measure(subject, tasks)
+            tested += zip((replace(row, chosen_by="validation") for row in measured), values, strict=True)
     tested.sort(key=lambda item: item[0].table_split)
     test.notes[:0] = validation.notes
     return test.result([*rows, *(row for row, _ in tested)], [*accuracies, *(values for _, values in tested)])

@@ -9,7 +9,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
+import tiny_results
 from tiny_checkpoints import ALONE, CONFIG
 from tiny_views import write_views
 from typer.testing import CliRunner
@@ -121,7 +124,8 @@ def test_each_split_is_tested_with_the_checkpoint_its_validation_classes_choose(
         assert last in note and "since 5-way needs more classes" in note
         path = run / "checkpoints" / last
         alone = evaluate(path, shards, config(table_splits=(row.table_split,)), table=TABLE).rows
-        assert alone == (row,)
+        assert (replace(alone[0], chosen_by="validation"),) == (row,)
+    assert {row.chosen_by for row in val} == {""}
 
 
 def test_of_equally_good_checkpoints_the_later_is_chosen(run: Path, shards: Path) -> None:
@@ -197,7 +201,7 @@ def test_wrong_flags_are_explained(shards: Path, run: Path, flags: list[str], me
 def test_old_result_rows_without_the_new_columns_are_read(tmp_path: Path, shards: Path) -> None:
     row = evaluate(None, shards, config(), network=NETWORK).rows[0]
     values = dict(vars(row))
-    for name in ("method", "run", "table", "table_split", "part"):
+    for name in ("method", "run", "table", "table_split", "part", "support_copies", "chosen_by"):
         del values[name]
     (tmp_path / "results.json").write_text(json.dumps([values]))
     (old,) = read_rows(tmp_path / "results.json")
@@ -208,6 +212,19 @@ def test_old_result_rows_without_the_new_columns_are_read(tmp_path: Path, shards
         -1,
         "all",
     )
+    assert (old.support_copies, old.chosen_by) == (1, "")
+    pq.write_table(pa.Table.from_pylist([values]), tmp_path / "results.parquet")
+    assert results.append_rows(tmp_path / "results.parquet", [replace(row, support_copies=5)])[0] == old
+
+
+@pytest.mark.parametrize("suffix", [".parquet", ".json"])
+def test_a_choice_replaces_an_earlier_one_and_nothing_else(tmp_path: Path, suffix: str) -> None:
+    chosen = {"table": "mine", "part": "test", "chosen_by": "validation"}
+    first = [tiny_results.row(0.5, table_split=i, step=10 + i, checkpoint_sha256=str(i), **chosen) for i in range(2)]
+    newest = tiny_results.row(0.4, table_split=0, step=10, checkpoint_sha256="0", table="mine", part="test")
+    later = tiny_results.row(0.6, table_split=0, step=30, checkpoint_sha256="3", **chosen)
+    results.append_rows(tmp_path / f"results{suffix}", [*first, newest])
+    assert results.append_rows(tmp_path / f"results{suffix}", [later]) == [later, first[1], newest]
 
 
 def test_evaluations_that_end_at_once_lose_no_rows(
