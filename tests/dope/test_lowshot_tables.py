@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -13,6 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import tiny_results
+import torch
 from tiny_checkpoints import ALONE, CONFIG
 from tiny_views import write_views
 from typer.testing import CliRunner
@@ -143,6 +145,27 @@ def test_selection_needs_a_run_with_checkpoints(shards: Path, run: Path, tmp_pat
         evaluate_best(tmp_path, shards, config(), TABLE)
     with pytest.raises(UsageError, match="--compare-untrained"):
         evaluate_best(run, shards, config(compare_untrained=True), TABLE)
+
+
+def test_damaged_and_diverged_checkpoints_are_passed_over_and_said(shards: Path, run: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(run, tmp_path / "my_run"))
+    found = sorted((copy / "checkpoints").glob("*.pt"))
+    found[3].write_bytes(b"damaged")
+    values = torch.load(found[2], weights_only=True)
+    for weights in values["network"].values():
+        if weights.is_floating_point():
+            weights.fill_(torch.nan)
+    torch.save(values, found[2])
+    found[2].with_name(found[2].name + ".sha256").unlink()
+    result = evaluate_best(copy, shards, config(), TABLE)
+    assert {r.step for r in result.rows} == {1, 2} and any("the best of 2 with" in note for note in result.notes)
+    passed = [note for note in result.notes if "was passed over" in note]
+    assert [note.split()[0] for note in passed] == [path.name for path in found[2:]]
+    assert "NaN" in passed[0] and "damaged" in passed[1]
+    for path in found:
+        path.write_bytes(b"damaged")
+    with pytest.raises(BadInput, match=r"none of its 4 checkpoints can be used; step-00000001\.pt: is damaged"):
+        evaluate_best(copy, shards, config(), TABLE)
 
 
 def test_training_classes_with_labels_are_never_tested(
