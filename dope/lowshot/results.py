@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import fcntl
+import os
 import typing
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -122,6 +123,22 @@ def append_rows(path: Path, rows: Iterable[ResultRow]) -> list[ResultRow]:
         merged |= {_identity(row): row for row in rows}
         _write(path, list(merged.values()))
     return list(merged.values())
+
+
+def check_appendable(path: Path) -> None:
+    """Whether `append_rows` will be able to add to the file: asked before hours of evaluation, not after.
+
+    Raises:
+        UsageError: another suffix, or a place where nothing can be written.
+        BadInput: the file is there and cannot be read.
+    """
+    _check_suffix(path)
+    if path.exists():
+        read_rows(path)
+    there = next(folder for folder in path.absolute().parents if folder.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        what = "cannot be written to" if there.is_dir() else "is no folder"
+        raise UsageError(what, where=there, remedy="Name a folder for the results by --out")
 
 
 @contextmanager

@@ -69,8 +69,7 @@ def subjects(
 
     method, trained, meta = load_method(checkpoint, device)
     path = Path(meta["path"])
-    folder = run or (path.parent.parent if path.parent.name == "checkpoints" else path.parent)
-    columns = {"method": method.name, "run": folder.resolve().name, "config_hash": meta["config_hash"]}
+    columns = {"method": method.name, "run": (run or run_of(path)).resolve().name, "config_hash": meta["config_hash"]}
     weights = {"checkpoint": path.name, "checkpoint_sha256": meta["sha256"], "step": meta["step"]}
     classes = meta["facts"].get("classes", ())
     subject = Subject(
@@ -92,6 +91,12 @@ def subjects(
             unsettled=random,
             source="random weights",
         )
+
+
+def run_of(checkpoint: Path) -> Path:
+    """The run's folder of RUN/checkpoints/NAME; of a file that lies elsewhere its own folder."""
+    folder = checkpoint.absolute().parent
+    return folder.parent if folder.name == "checkpoints" else folder
 
 
 def encoder_subject(embedder: Embedder, *, label: str, sha256: str | None, config_hash: str) -> Subject:

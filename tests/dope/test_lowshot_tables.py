@@ -24,13 +24,14 @@ from dope.checkpoints import save_checkpoint
 from dope.common.errors import BadInput, UsageError
 from dope.lowshot import results
 from dope.lowshot.episodes import EpisodeConfig
-from dope.lowshot.evaluate import EvaluationConfig, evaluate
+from dope.lowshot.evaluate import Evaluation, EvaluationConfig, evaluate
 from dope.lowshot.results import ResultRow, mean_over_splits, read_rows
 from dope.lowshot.selection import best_checkpoints, evaluate_best
 from dope.lowshot.splits import Split, SplitTable
 from dope.lowshot.tasks import validation_protocol
 from dope.methods import method_of
 from dope.networks import NetworkConfig
+from dope.results.sources import NAMES
 from dope.state import new_state
 
 NETWORK = NetworkConfig(width=0.125, pyramid=8, projector=(8, 4))
@@ -219,6 +220,46 @@ def test_wrong_flags_are_explained(shards: Path, run: Path, flags: list[str], me
     arguments = ["eval", str(run), str(shards), "--episodes", "3", "--queries", "2", *flags]
     done = CliRunner().invoke(app, arguments)
     assert done.exit_code != 0 and message in str(done.exception)
+
+
+def test_what_cannot_be_kept_is_refused_before_it_is_measured(
+    shards: Path, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Evaluation, "measure", None)
+    arguments = ["eval", str(run), str(shards), "--ways", "2", "--queries", "2", "--device", "cpu", "--out"]
+
+    def refused(out: Path) -> str:
+        return str(CliRunner().invoke(app, [*arguments, str(out)]).exception)
+
+    (tmp_path / "file").write_text("")
+    assert f"{tmp_path / 'file'}: is no folder" in refused(tmp_path / "file")
+    for name in NAMES:
+        (tmp_path / "damaged").mkdir(exist_ok=True)
+        (tmp_path / "damaged" / name).write_bytes(b"nonsense")
+        assert str(tmp_path / "damaged" / name) in refused(tmp_path / "damaged")
+        (tmp_path / "damaged" / name).unlink()
+    monkeypatch.setattr("os.access", lambda *_: False)
+    assert "cannot be written to. Name a folder for the results by --out" in refused(tmp_path / "new" / "deep")
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_protocol_given_twice_is_measured_once_and_rows_lie_beside_the_checkpoint(
+    shards: Path, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def evaluated(name: Path) -> list[ResultRow]:
+        flags = ["--ways", "2", "--ways", "2", "--shots", "1", "--queries", "2", "--episodes", "3", "--device", "cpu"]
+        done = CliRunner().invoke(app, ["eval", str(name), str(shards), *flags])
+        assert done.exit_code == 0 and "at least" not in done.output, done.output
+        (file,) = tmp_path.rglob("results.json")
+        assert file.parent == tmp_path / "mine" / "eval"
+        return read_rows(file)
+
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine" / "checkpoints").mkdir(parents=True)
+    for place in (tmp_path / "mine", tmp_path / "mine" / "checkpoints"):
+        shutil.copy(run / "checkpoints" / "step-00000002.pt", place / "net.pt")
+    (one,) = evaluated(Path("mine/net.pt"))
+    assert one.run == "mine" and evaluated(tmp_path / "mine" / "checkpoints" / "net.pt") == [one]
 
 
 def test_old_result_rows_without_the_new_columns_are_read(tmp_path: Path, shards: Path) -> None:
