@@ -80,6 +80,7 @@ def evaluate_best(
         raise BadInput(what, where=run, remedy="Train again into another folder")
     test.notes += [f"{name} was passed over: {reason}" for name, reason in passed_over.items()]
     chosen = best_checkpoints(rows)
+    usable = len(checkpoints) - len(passed_over)
 
     splits_of: defaultdict[str, list[int]] = defaultdict(list)
     for split, row in chosen.items():
@@ -87,7 +88,7 @@ def evaluate_best(
         splits_of[row.checkpoint].append(split)
         fewer = f", since {row.asked_ways}-way needs more classes" if row.ways < row.asked_ways else ""
         test.notes.append(
-            f"split {split}: {row.checkpoint}, the best of {len(checkpoints) - len(passed_over)} with {100 * row.accuracy:.2f} ± "
+            f"split {split}: {row.checkpoint}, the best of {usable} with {100 * row.accuracy:.2f} ± "
             f"{100 * row.ci95:.2f} % on {row.n_classes} validation classes ({row.protocol}{fewer})"
         )
     tested: list[tuple[ResultRow, NDArray[np.float64]]] = []
