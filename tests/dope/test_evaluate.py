@@ -125,6 +125,7 @@ def test_a_checkpoint_is_compared_with_random_weights_in_the_same_episodes(
     checkpoint = tmp_path / "step-00000003.pt"
     settings = replace(load_config("nano", None, ["data.image_size=32"]), network=NETWORK)
     meta = {"path": str(checkpoint), "sha256": "ab", "step": 3, "config_hash": "cd", "facts": {}, "config": {}}
+    meta["dataset"] = "ef"
     loaded = []
 
     def load(path: Path, device: object) -> tuple[object, nn.Module, dict[str, object]]:
