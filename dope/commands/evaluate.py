@@ -66,7 +66,7 @@ def evaluate(
         typer.Option(
             "--select",
             help="Of all checkpoints of RUN, test on each split the one that is best on its validation classes "
-            "(5-way 1-shot; of equal ones the later).",
+            "(5-way 1-shot; of equal ones the later; damaged ones are passed over).",
         ),
     ] = False,
     categories: Annotated[
@@ -203,7 +203,7 @@ def evaluate(
             checkpoint = find_checkpoint(run)
             files = _files(out or (run if run.is_dir() else run_of(run)) / "eval")
             result = run_evaluation(checkpoint, shards, config, table=splits, **options)
-    console = Console(highlight=False)
+    console = Console(highlight=False, emoji=False)  # "encode.py:zero: ..." is no picture
     console.print(results_table([row for row in result.rows if not select or row.part == "test"]))
     for note in result.notes:
         console.print(escape(note), soft_wrap=True)

@@ -200,6 +200,7 @@ def results_table(rows: Sequence[ResultRow], title: str = "Low-shot recognition"
 
     Splits of a table are shown as their mean. What all rows have in common is said once, below the table.
     """
+    from rich.markup import escape
     from rich.table import Table
 
     counted = mean_over_splits(rows)
@@ -218,7 +219,7 @@ def results_table(rows: Sequence[ResultRow], title: str = "Low-shot recognition"
     if max(counts, default=1) > 1:
         del details["views"]
     shared = [values[0] for values in details.values() if len(set(values)) == 1]
-    table.caption = ", ".join(value for value in shared if value)
+    table.caption = escape(", ".join(value for value in shared if value))
     varying = {name: values for name, values in details.items() if len(set(values)) > 1}
     for name in ("protocol", "network", *varying):
         table.add_column(name)
@@ -227,7 +228,7 @@ def results_table(rows: Sequence[ResultRow], title: str = "Low-shot recognition"
     for i, row in enumerate(rows):
         trained = row.network + (f", step {row.step}" if row.step is not None else "")
         accuracy = f"{100 * row.accuracy:.2f} ± {100 * row.ci95:.2f}"
-        cells = [values[i] for values in varying.values()]
+        cells = [escape(values[i]) for values in varying.values()]
         table.add_row(_protocol(row), trained, *cells, accuracy, f"{100 * row.chance:.1f}")
     return table
 

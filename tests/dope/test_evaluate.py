@@ -284,5 +284,7 @@ def test_the_table_fits_a_terminal_and_shows_accuracy_beside_chance() -> None:
     )
     reduced = shown(row(ways=3, shots=5, shot_mode="one_instance"))
     assert "of one object" in reduced and "5-way)" in reduced
+    named = shown(row(method="a[1].py:f"), row(method="[b].py:f"), row(table="[x]", table_split=0))
+    assert "a[1].py:f" in named and "[b].py:f" in named and "[x]" in named
     several = shown(row(), row(classes="instance", n_classes=30))
     assert "30 objects" in several and "10 categories" in several
