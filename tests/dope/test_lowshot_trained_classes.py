@@ -1,26 +1,20 @@
-"""Classes whose labels a network has seen are no new classes, nor those whose objects it has seen without labels."""
+"""Classes whose labels a network has seen are no new classes."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
-from tiny_checkpoints import ALONE, CONFIG
 from tiny_labelled import write_labelled
-from tiny_shards import write_shards
 
-from dope.checkpoints import find_checkpoint, save_checkpoint
+from dope.checkpoints import find_checkpoint
 from dope.common.errors import UsageError
 from dope.config import load_config
 from dope.lowshot.episodes import EpisodeConfig
 from dope.lowshot.evaluate import EvaluationConfig, evaluate
 from dope.lowshot.splits import Split, SplitTable
-from dope.methods import method_of
-from dope.shard_index import read_index
-from dope.state import new_state
 from dope.trainer import train
 
 SMALL = [
@@ -48,26 +42,3 @@ def test_trained_classes_are_told_and_in_a_table_refused(shards: Path, tmp_path:
     leaking = SplitTable("mine", (), (Split(("ring",), ("disc", "square")),))
     with pytest.raises(UsageError, match="was trained with the labels of disc, which split 0 of mine tests"):
         evaluate(run, shards, PROTOCOL, table=leaking)
-
-
-def test_objects_that_were_learnt_from_without_labels_are_told(tmp_path: Path) -> None:
-    shards = write_shards(tmp_path / "shards", n_objects=12, val_objects=4)
-    elsewhere = write_shards(tmp_path / "elsewhere", n_objects=16, seed=1)
-    for name, categories in (("all", ()), ("some", ("category_0", "category_1"))):
-        config = replace(CONFIG, data=replace(CONFIG.data, categories=categories))
-        fingerprint = read_index(shards, "train").fingerprint
-        save_checkpoint(tmp_path / name, new_state(method_of(config), ALONE), method_of(config), fingerprint)
-
-    def notes(name: str, on: Path = shards, table: SplitTable | None = None, **changes: Any) -> str:
-        config = replace(PROTOCOL, **changes)
-        told = evaluate(tmp_path / name, on, config, table=table).notes
-        return " ".join(note for note in told if "without labels" in note)
-
-    told = notes("all", compare_untrained=True)
-    assert told.count("learnt") == 1  # the random weights did not
-    assert told.startswith("all learnt from pairs of these shards") and "category_3 are not new to it" in told
-    assert "objects of category_0, category_1 are not new" in notes("some")
-    assert notes("all", elsewhere) == notes("some", categories=("category_2", "category_3")) == ""
-    splits = SplitTable("mine", (), (Split((), ("category_1", "category_2")), Split((), ("category_2", "category_3"))))
-    told = "objects of category_1 are not to be tested by mine; --set data.categories"
-    assert told in notes("some", table=splits) and "category_3" in notes("all", table=splits)
