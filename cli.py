@@ -107,7 +107,7 @@ def _explain(error: DopeError) -> None:
     from rich.console import Console
     from rich.markup import escape
 
-    Console(stderr=True, highlight=False).print(f"[red]error:[/] {escape(str(error))}", soft_wrap=True)
+    Console(stderr=True, highlight=False, emoji=False).print(f"[red]error:[/] {escape(str(error))}", soft_wrap=True)
 
 
 if __name__ == "__main__":

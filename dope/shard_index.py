@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import hashlib
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -132,9 +132,7 @@ def read_index(shards: Shards, split: str) -> SampleIndex:
             correspondences=columns["n_correspondences"].astype(np.int64),
             categories=np.array([name or "" for name in table["category"].to_pylist()], str),
             objects=np.searchsorted(sequences, names),
-            fingerprint=_fingerprint(
-                {name: manifest[name]["sha256"] for name in sorted(manifest) if _is_of(name, split)}
-            ),
+            fingerprint=fingerprint_of({name: entry["sha256"] for name, entry in manifest.items()}, split),
         )
     except (pa.ArrowException, ValueError, TypeError) as error:
         what = f"has values of another kind than `dope prep shards` writes ({reason_of(error)})"
@@ -244,5 +242,7 @@ def _is_of(shard: str, split: str) -> bool:
     return shard.startswith(split + "-")
 
 
-def _fingerprint(hashes: dict[str, str]) -> str:
-    return hashlib.sha256(json.dumps(hashes, sort_keys=True).encode()).hexdigest()[:16]
+def fingerprint_of(hashes: Mapping[str, Any], split: str) -> str:
+    """16 hex digits of the shards of a split, by the SHA-256 of each."""
+    own = {name: value for name, value in hashes.items() if _is_of(name, split)}
+    return hashlib.sha256(json.dumps(own, sort_keys=True).encode()).hexdigest()[:16]

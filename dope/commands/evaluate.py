@@ -66,7 +66,7 @@ def evaluate(
         typer.Option(
             "--select",
             help="Of all checkpoints of RUN, test on each split the one that is best on its validation classes "
-            "(5-way 1-shot; of equal ones the later).",
+            "(5-way 1-shot; of equal ones the later; damaged ones are passed over).",
         ),
     ] = False,
     categories: Annotated[
@@ -165,8 +165,8 @@ def evaluate(
     }  # fmt: skip
     protocols = tuple(
         settings.from_mapping(EpisodeConfig, {**episode, "ways": way, "shots": shot}, where="dope eval")
-        for way in ways or [5]
-        for shot in shots or [1]
+        for way in dict.fromkeys(ways or [5])  # given twice, it is measured once
+        for shot in dict.fromkeys(shots or [1])
     )
     values: dict[str, Any] = {
         "classifier": classifier, "split": split, "compare_untrained": compare_untrained, "part": part,
@@ -186,32 +186,45 @@ def evaluate(
 
             mask: MaskChoice = "given" if encoder_mask == "given" else "none"
             subject = encoder_on_shards(encoder, shards, mask=mask, device=options["device"])
+            files = _files(out or default_folder(subject.embedder.name))
             result = evaluate_embedders([subject], shards, config, table=splits, **options)
-            folder = out or default_folder(subject.embedder.name)
         elif select:
             from dope.lowshot.selection import evaluate_best
 
             assert splits is not None and run is not None
+            files = _files(out or run / "eval")
             result = evaluate_best(run, shards, config, splits, **options)
         else:
             from dope.checkpoints import find_checkpoint
             from dope.lowshot.evaluate import evaluate as run_evaluation
+            from dope.lowshot.subjects import run_of
 
             assert run is not None
-            result = run_evaluation(find_checkpoint(run), shards, config, table=splits, **options)
-    if run is not None:
-        folder = out or (run if run.is_dir() else run.parent.parent) / "eval"
-    append_rows(folder / "results.parquet", result.rows)
-    append_rows(folder / "results.json", result.rows)
-    console = Console(highlight=False)
+            checkpoint = find_checkpoint(run)
+            files = _files(out or (run if run.is_dir() else run_of(run)) / "eval")
+            result = run_evaluation(checkpoint, shards, config, table=splits, **options)
+    console = Console(highlight=False, emoji=False)  # "encode.py:zero: ..." is no picture
     console.print(results_table([row for row in result.rows if not select or row.part == "test"]))
     for note in result.notes:
         console.print(escape(note), soft_wrap=True)
+    for file in files:  # shown first: what was measured is not lost where it cannot be kept
+        append_rows(file, result.rows)
     console.print(
         f"{result.encode_ms_per_view:.0f} ms a view to encode, {result.match_ms_per_episode:.1f} ms an episode to "
-        f"match; rows in [bold]{escape(str(folder / 'results.parquet'))}[/]",
+        f"match; rows in [bold]{escape(str(files[0]))}[/]",
         soft_wrap=True,
     )
+
+
+def _files(folder: Path) -> list[Path]:
+    """Where the rows go, both kinds of which can be added to."""
+    from dope.lowshot.results import check_appendable
+    from dope.results.sources import NAMES
+
+    files = [folder / name for name in NAMES]
+    for file in files:
+        check_appendable(file)
+    return files
 
 
 def _check_encoder(encoder: str | None, mask: str, *, select: bool, compare_untrained: bool) -> None:

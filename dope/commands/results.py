@@ -58,7 +58,8 @@ def results(
     """The paper's tables from the result rows of runs: a row a method, a column a setting, beside the paper's figures.
 
     A cell is the accuracy with its 95% confidence interval; of a table with splits (modelnet40_ls, ...) the mean.
-    Rows that were not measured in the same way are refused, and the columns in which they differ are named.
+    Rows that were not measured in the same way are refused, and the columns in which they differ are named. Checkpoints
+    that `dope eval --select` chose are one row, which says so; others of a run are a row each.
 
     Examples:
 

@@ -25,7 +25,7 @@ from dope.lowshot.episodes import EpisodeConfig
 from dope.lowshot.matching import MatchingConfig
 from dope.lowshot.results import ResultRow
 from dope.lowshot.splits import SplitTable
-from dope.lowshot.subjects import Subject, refuse_trained_classes, subjects, trained_among
+from dope.lowshot.subjects import Subject, refuse_trained_classes, seen_among, subjects, trained_among
 from dope.lowshot.support_copies import SupportCopies
 from dope.lowshot.tasks import Part, Task, split_tasks
 from dope.lowshot.views import ViewShards
@@ -203,6 +203,7 @@ class Evaluation:
                 self.notes.append(
                     f"{subject.source} learnt with the labels of {', '.join(known)}: these are not new to it"
                 )
+        self._tell_seen(subject)
         work = Work(
             self.views, config.matching, self.device, config.batch, config.memory_gib, config.cache, config.spill,
             config.image_size, self.progress, subject.source,
@@ -234,6 +235,23 @@ class Evaluation:
         self._took = [old + new for old, new in zip(self._took, took, strict=True)]
         return rows, accuracies
 
+    def _tell_seen(self, subject: Subject) -> None:
+        """Note what a network learnt from without labels, and is tested on: with a table its classes are to be new."""
+        config = self.config
+        if self.table is not None:
+            names = {name for task in self.tasks for name in task.categories}
+            end = f"are not to be tested by {self.table.name}; --set data.categories of `dope train` leaves them out"
+        elif config.protocols[0].classes == "category" and config.split != "val":
+            names = {name for task in self.tasks for name in task.drawn.names}
+            end = "are not new to it; --split val tests those held out"
+        else:
+            return
+        seen = seen_among(subject, self.views, names)
+        if seen:
+            told = f"{', '.join(seen[:8])}{' ...' if len(seen) > 8 else ''}"
+            who = subject.columns["run"]
+            self.notes.append(f"{who} learnt from pairs of these shards, without labels: objects of {told} {end}")
+
     def _tasks(self) -> list[Task]:
         config = self.config
         if self.table is None:
@@ -254,8 +272,6 @@ class Evaluation:
         config, used = self.config, task.drawn.config
         kept = ("classes", "ways", "shots", "shot_mode", "queries", "episodes", "seed")
         other: dict[str, Any] = {"categories": config.categories, "image_size": config.image_size}
-        if config.support_copies > 1:
-            other["support_copies"] = config.support_copies
         if self.table is not None:
             other["table"] = settings.config_hash(self.table)
         return {
@@ -264,6 +280,7 @@ class Evaluation:
             "asked_queries": task.asked.queries,
             "chance": task.drawn.chance,
             "classifier": classifier,
+            "support_copies": config.support_copies,
             "split": config.split,
             "evaluation_hash": settings.config_hash({**other, "matching": settings.to_dict(config.matching)}),
         }

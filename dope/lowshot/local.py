@@ -126,11 +126,11 @@ class _QueryCells:
     def say_fallbacks(self) -> None:
         """Note how many queries were compared by random cells."""
         if self._fallbacks:
-            points = self._work.matching.points
-            what = (
-                f"{self._fallbacks:,} of {len(self._views):,} query views have fewer than {points} cells of predicted"
+            points, of = self._work.matching.points, f"{self._fallbacks:,} of {len(self._views):,}"
+            self._work.notes.append(
+                f"{self._work.source}: {of} query views have fewer than {points} cells of foreground: "
+                "random cells of the whole view were compared instead"
             )
-            self._work.notes.append(f"{what} foreground: random cells of the whole view were compared instead")
 
     def _allocate(self, dim: int) -> Tensor:
         shape = (*self._norms.shape, dim)

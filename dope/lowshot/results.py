@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import fcntl
+import os
 import typing
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 OUTCOME = ("accuracy", "ci95")
+WEIGHTS = ("checkpoint", "checkpoint_sha256", "step")
+CLASSIFIERS = {"local": "local matching", "centroid": "nearest centroid", "nearest": "1-NN", "logistic": "logistic"}
+"""Their names in tables; others stay as they are."""
 
 
 @dataclass(frozen=True)
@@ -86,14 +90,26 @@ class ResultRow:
     """Which of its splits, from 0; -1 without a table."""
     part: str = "all"
     """Classes of that split: test or val; all without a table."""
+    support_copies: int = 1
+    """How often logistic regression learnt from each shot; beyond the first, augmented as in training."""
+    chosen_by: str = ""
+    """"validation": of all checkpoints of the run, the split's validation classes chose this one (`--select`)."""
 
     @property
     def protocol(self) -> str:
         return f"{self.ways}-way {self.shots}-shot"
 
+    @property
+    def classifier_in_words(self) -> str:
+        """With how it was fitted, where that is not the usual way."""
+        name = CLASSIFIERS.get(self.classifier, self.classifier)
+        return f"{name}, {self.support_copies} copies a shot" if self.support_copies > 1 else name
+
 
 def append_rows(path: Path, rows: Iterable[ResultRow]) -> list[ResultRow]:
     """Add rows to a .parquet or .json file, in order; a row measured before is replaced. Returns all rows.
+
+    A row of a chosen checkpoint replaces that of an earlier choice, whichever it was.
 
     Several processes may do so at once: each adds to what the others wrote.
 
@@ -107,6 +123,22 @@ def append_rows(path: Path, rows: Iterable[ResultRow]) -> list[ResultRow]:
         merged |= {_identity(row): row for row in rows}
         _write(path, list(merged.values()))
     return list(merged.values())
+
+
+def check_appendable(path: Path) -> None:
+    """Whether `append_rows` will be able to add to the file: asked before hours of evaluation, not after.
+
+    Raises:
+        UsageError: another suffix, or a place where nothing can be written.
+        BadInput: the file is there and cannot be read.
+    """
+    _check_suffix(path)
+    if path.exists():
+        read_rows(path)
+    there = next(folder for folder in path.absolute().parents if folder.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        what = "cannot be written to" if there.is_dir() else "is no folder"
+        raise UsageError(what, where=there, remedy="Name a folder for the results by --out")
 
 
 @contextmanager
@@ -151,9 +183,7 @@ def mean_over_splits(rows: Iterable[ResultRow]) -> list[tuple[ResultRow, int]]:
     return [(_mean(group), len(group)) for group in groups.values()]
 
 
-_PER_SPLIT = (
-    *OUTCOME, "table_split", "n_classes", "n_objects", "n_views", "checkpoint", "checkpoint_sha256", "step",
-)  # fmt: skip
+_PER_SPLIT = (*OUTCOME, *WEIGHTS, "table_split", "n_classes", "n_objects", "n_views")
 
 
 def _mean(rows: Sequence[ResultRow]) -> ResultRow:
@@ -161,8 +191,7 @@ def _mean(rows: Sequence[ResultRow]) -> ResultRow:
         return rows[0]
     means = {name: sum(getattr(row, name) for row in rows) / len(rows) for name in OUTCOME}
     least = {name: min(getattr(row, name) for row in rows) for name in ("n_classes", "n_objects", "n_views")}
-    weights = ("checkpoint", "checkpoint_sha256", "step")
-    differing: dict[str, Any] = {name: None for name in weights if len({getattr(row, name) for row in rows}) > 1}
+    differing: dict[str, Any] = {name: None for name in WEIGHTS if len({getattr(row, name) for row in rows}) > 1}
     return dataclasses.replace(rows[0], table_split=-1, **means, **least, **differing)
 
 
@@ -171,6 +200,7 @@ def results_table(rows: Sequence[ResultRow], title: str = "Low-shot recognition"
 
     Splits of a table are shown as their mean. What all rows have in common is said once, below the table.
     """
+    from rich.markup import escape
     from rich.table import Table
 
     counted = mean_over_splits(rows)
@@ -181,14 +211,15 @@ def results_table(rows: Sequence[ResultRow], title: str = "Low-shot recognition"
         "of": [_classes(row, count) for row, count in counted],
         "views": [f"{row.n_views} views ({row.split})" for row in rows],
         "method": [row.method if row.network == "trained" else "" for row in rows],
-        "classifier": [{"local": "local matching"}.get(row.classifier, row.classifier) for row in rows],
+        "classifier": [row.classifier_in_words for row in rows],
+        "checkpoint": ["chosen on validation classes" if row.chosen_by else "" for row in rows],
         "queries": [f"{row.queries} queries a class" for row in rows],
         "episodes": [f"{row.episodes:,} episodes" for row in rows],
     }
     if max(counts, default=1) > 1:
         del details["views"]
     shared = [values[0] for values in details.values() if len(set(values)) == 1]
-    table.caption = ", ".join(value for value in shared if value)
+    table.caption = escape(", ".join(value for value in shared if value))
     varying = {name: values for name, values in details.items() if len(set(values)) > 1}
     for name in ("protocol", "network", *varying):
         table.add_column(name)
@@ -197,7 +228,7 @@ def results_table(rows: Sequence[ResultRow], title: str = "Low-shot recognition"
     for i, row in enumerate(rows):
         trained = row.network + (f", step {row.step}" if row.step is not None else "")
         accuracy = f"{100 * row.accuracy:.2f} ± {100 * row.ci95:.2f}"
-        cells = [values[i] for values in varying.values()]
+        cells = [escape(values[i]) for values in varying.values()]
         table.add_row(_protocol(row), trained, *cells, accuracy, f"{100 * row.chance:.1f}")
     return table
 
@@ -227,7 +258,8 @@ def _protocol(row: ResultRow) -> str:
 
 def _identity(row: ResultRow) -> tuple[Any, ...]:
     values = dataclasses.asdict(row)
-    return tuple(value for name, value in values.items() if name not in OUTCOME)
+    without = (*OUTCOME, *WEIGHTS) if row.chosen_by else OUTCOME
+    return tuple(value for name, value in values.items() if name not in without)
 
 
 def _write(path: Path, rows: Sequence[ResultRow]) -> None:

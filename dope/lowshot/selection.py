@@ -19,6 +19,7 @@ from dope.lowshot.splits import SplitTable
 from dope.lowshot.subjects import subjects
 from dope.lowshot.tasks import validation_protocol
 from dope.lowshot.views import ViewShards
+from dope.lowshot.work import NotFinite
 from dope.storage import Shards
 
 
@@ -34,15 +35,16 @@ def evaluate_best(
     """Test each split of a table with the checkpoint of a run that is best on the split's validation classes.
 
     Rows: of every checkpoint on the validation classes of each split (part "val"), then the tests (part "test"), whose
-    column `checkpoint` says which one was chosen.
+    column `checkpoint` says which one was chosen, and `chosen_by` that it was.
 
     Args:
-        run: a run's folder; all of its checkpoints are tried.
+        run: a run's folder; all of its checkpoints are tried. One that is damaged (or was deleted by the training that
+            goes on), or whose features are not finite, is passed over, which the notes say.
         config: the protocols of the test.
 
     Raises:
         UsageError: not a run's folder, or the settings contradict a selection, or views do not suffice.
-        BadInput: the run has no checkpoint, or one cannot be read.
+        BadInput: the run has no checkpoint, or none that can be used.
     """
     checkpoints = _checkpoints(run)
     if config.part != "test" or config.compare_untrained:
@@ -56,14 +58,29 @@ def evaluate_best(
 
     rows: list[ResultRow] = []
     accuracies: list[NDArray[np.float64]] = []
+    passed_over: dict[str, str] = {}
     for number, path in enumerate(checkpoints):
         if progress is not None:
             progress("checkpoints", number, len(checkpoints))
-        for subject in subjects(path, device, run=run):
+        try:
+            (subject,) = subjects(path, device, run=run)
+        except BadInput as error:
+            passed_over[path.name] = error.what
+            continue
+        try:
             more = validation.measure(subject)
-            rows += more[0]
-            accuracies += more[1]
+        except NotFinite as error:
+            passed_over[path.name] = error.what
+            continue
+        rows += more[0]
+        accuracies += more[1]
+    if len(passed_over) == len(checkpoints):
+        name, reason = next(iter(passed_over.items()))
+        what = f"none of its {len(checkpoints)} checkpoints can be used; {name}: {reason}"
+        raise BadInput(what, where=run, remedy="Train again into another folder")
+    test.notes += [f"{name} was passed over: {reason}" for name, reason in passed_over.items()]
     chosen = best_checkpoints(rows)
+    usable = len(checkpoints) - len(passed_over)
 
     splits_of: defaultdict[str, list[int]] = defaultdict(list)
     for split, row in chosen.items():
@@ -71,7 +88,7 @@ def evaluate_best(
         splits_of[row.checkpoint].append(split)
         fewer = f", since {row.asked_ways}-way needs more classes" if row.ways < row.asked_ways else ""
         test.notes.append(
-            f"split {split}: {row.checkpoint}, the best of {len(checkpoints)} with {100 * row.accuracy:.2f} ± "
+            f"split {split}: {row.checkpoint}, the best of {usable} with {100 * row.accuracy:.2f} ± "
             f"{100 * row.ci95:.2f} % on {row.n_classes} validation classes ({row.protocol}{fewer})"
         )
     tested: list[tuple[ResultRow, NDArray[np.float64]]] = []
@@ -80,7 +97,8 @@ def evaluate_best(
             continue
         tasks = [task for task in test.tasks if task.columns["table_split"] in splits_of[path.name]]
         for subject in subjects(path, device, run=run):
-            tested += zip(*test.measure(subject, tasks), strict=True)
+            measured, values = test.measure(subject, tasks)
+            tested += zip((replace(row, chosen_by="validation") for row in measured), values, strict=True)
     tested.sort(key=lambda item: item[0].table_split)
     test.notes[:0] = validation.notes
     return test.result([*rows, *(row for row, _ in tested)], [*accuracies, *(values for _, values in tested)])

@@ -77,8 +77,9 @@ def read_split_file(path: Path) -> SplitTable:
     """Read a table of splits.
 
     Raises:
-        BadInput: absent, not JSON, of another form; a class twice, in both parts of a split or in a part and in base;
-            no split, or no test class. Names file, split and class.
+        BadInput: absent, not JSON, of another form; other splits under the name of one of the paper's tables; a class
+            twice, in both parts of a split or in a part and in base; no split, or no test class. Names file, split and
+            class.
     """
     values = files.read_json(path, remedy=FORMAT)
     if not isinstance(values, dict) or ("splits" not in values and "val_test" not in values):
@@ -86,6 +87,11 @@ def read_split_file(path: Path) -> SplitTable:
     _refuse_doubled_keys(path)
     table = _of_paper(values, path) if "val_test" in values else _of_user(values, path)
     _check(table, path)
+    known = TABLES / f"{table.name}.json"
+    if known.is_file() and table != _of_paper(files.read_json(known), known):
+        # its rows would stand beside the paper's figures
+        what = f"has the name of the paper's table '{table.name}', and other splits"
+        raise BadInput(what, where=path, remedy="Give the file another name")
     return table
 
 

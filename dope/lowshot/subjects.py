@@ -19,6 +19,8 @@ from dope.networks.untrained import untrained_network
 if TYPE_CHECKING:
     from torch import nn
 
+    from dope.lowshot.views import ViewShards
+
 NO_CHECKPOINT = {"checkpoint": None, "checkpoint_sha256": None, "step": None}
 
 
@@ -34,6 +36,10 @@ class Subject(NamedTuple):
     """The transform that it was trained with."""
     trained_classes: tuple[str, ...] = ()
     """Classes whose labels it was trained with."""
+    pairs: str = ""
+    """Fingerprint of the pairs that it was trained on without labels; empty where there are none."""
+    pair_categories: tuple[str, ...] = ()
+    """Only the pairs of these categories; none given: all."""
     source: str = "the encoder"
     """What it is, for errors."""
 
@@ -69,8 +75,7 @@ def subjects(
 
     method, trained, meta = load_method(checkpoint, device)
     path = Path(meta["path"])
-    folder = run or (path.parent.parent if path.parent.name == "checkpoints" else path.parent)
-    columns = {"method": method.name, "run": folder.resolve().name, "config_hash": meta["config_hash"]}
+    columns = {"method": method.name, "run": (run or run_of(path)).resolve().name, "config_hash": meta["config_hash"]}
     weights = {"checkpoint": path.name, "checkpoint_sha256": meta["sha256"], "step": meta["step"]}
     classes = meta["facts"].get("classes", ())
     subject = Subject(
@@ -78,6 +83,8 @@ def subjects(
         {"network": "trained", **columns, **weights},
         augmentation=method.config.augmentation,
         trained_classes=tuple(classes) if isinstance(classes, list | tuple) else (),
+        pairs=meta["dataset"] if method.pairs else "",
+        pair_categories=method.config.data.categories,
         source=str(path),
     )
     yield subject
@@ -90,8 +97,16 @@ def subjects(
             embedder=method.embedder(random),
             columns={**columns, **NO_CHECKPOINT, **network_columns},
             unsettled=random,
+            trained_classes=(),
+            pairs="",
             source="random weights",
         )
+
+
+def run_of(checkpoint: Path) -> Path:
+    """The run's folder of RUN/checkpoints/NAME; of a file that lies elsewhere its own folder."""
+    folder = checkpoint.absolute().parent
+    return folder.parent if folder.name == "checkpoints" else folder
 
 
 def encoder_subject(embedder: Embedder, *, label: str, sha256: str | None, config_hash: str) -> Subject:
@@ -114,6 +129,12 @@ def trained_among(subject: Subject, names: Iterable[str]) -> list[str]:
 
     known = {normalised(name) for name in subject.trained_classes}
     return sorted(name for name in names if normalised(name) in known)
+
+
+def seen_among(subject: Subject, views: ViewShards, names: Iterable[str]) -> list[str]:
+    """Which of these categories a network saw objects of, without their labels, in the pairs beside `views`; sorted."""
+    seen = views.categories_of_pairs(subject.pairs) if subject.pairs else frozenset()
+    return sorted(seen.intersection(names).intersection(subject.pair_categories or seen))
 
 
 def refuse_trained_classes(subject: Subject, table: str, tested: Mapping[str, int]) -> None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from dope.common.errors import BadInput, UsageError
 from dope.decoding import resized
-from dope.shard_index import read_table
+from dope.shard_index import fingerprint_of, read_table
 from dope.storage import Shards, Storage, open_storage
 from dope.tar_samples import REMAKE, Location, ShardReader
 
@@ -142,12 +142,24 @@ class ViewShards:
     @property
     def fingerprint(self) -> str:
         """16 hex digits that change whenever a view does: of the table and, where listed, the shards' hashes."""
-        names = sorted(set(self.columns["shard"]))
-        known = "dataset.json" in self._storage.sizes()
-        listed = self._storage.read_json("dataset.json").get("shards", {}) if known else {}
-        hashes = [[name, listed.get(name, {}).get("sha256")] for name in names]
+        listed = self._listed()
+        hashes = [[name, listed.get(name)] for name in sorted(set(self.columns["shard"]))]
         table = [[self.columns[name][i] for name in COLUMNS] for i in range(len(self))]
         return sha256(json.dumps([hashes, table], default=str).encode()).hexdigest()[:16]
+
+    def categories_of_pairs(self, fingerprint: str) -> frozenset[str]:
+        """Categories of the pairs for training beside these views; none where those have another fingerprint."""
+        if fingerprint_of(self._listed(), "train") != fingerprint or "index.parquet" not in self._storage.sizes():
+            return frozenset()
+        table, _ = read_table(self._storage, "index.parquet", ("category", "split"), may_be_null=("category",))
+        rows = zip(table["category"].to_pylist(), table["split"].to_pylist(), strict=True)
+        return frozenset(name for name, split in rows if name and split == "train")
+
+    def _listed(self) -> dict[str, Any]:
+        """The shards' SHA-256 (None where unknown) by name, as far as dataset.json lists them."""
+        known = "dataset.json" in self._storage.sizes()
+        listed = self._storage.read_json("dataset.json").get("shards", {}) if known else {}
+        return {name: entry.get("sha256") for name, entry in listed.items()}
 
     def _members(self, index: int) -> dict[str, bytes]:
         return self._reader.sample(**{name: self.columns[name][index] for name in Location._fields})

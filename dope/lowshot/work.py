@@ -23,6 +23,10 @@ from dope.lowshot.views import ViewShards
 Spill = Literal["auto", "always", "never"]
 
 
+class NotFinite(DopeError):
+    """Features that are NaN or infinite."""
+
+
 @dataclass
 class Work:
     """The views, how they are compared, and how much of what may be used for it."""
@@ -64,7 +68,7 @@ class Work:
         """Encode views once each, in order: (index, cells).
 
         Raises:
-            DopeError: a descriptor is not finite.
+            NotFinite: a descriptor is.
         """
         done = 0
         for chunk, inputs in self.images(embedder, indices):
@@ -76,9 +80,9 @@ class Work:
             self.encoded += len(chunk)
             self.tell(what, done, len(indices))
 
-    def not_finite(self, index: int) -> DopeError:
+    def not_finite(self, index: int) -> NotFinite:
         """The error for a view whose features are NaN or infinite."""
-        return DopeError(
+        return NotFinite(
             f"the features of view {self.views.columns['key'][index]} of {self.views.folder} are NaN or infinite",
             where=self.source,
             remedy="Its weights are damaged or training diverged: evaluate an earlier checkpoint",

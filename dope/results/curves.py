@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from dope.common import files
 from dope.common.errors import DopeError, UsageError
+from dope.lowshot.results import ResultRow
 from dope.results import paper
 from dope.results.one_protocol import check_no_duplicates, check_one_protocol
 from dope.results.rows import Line, columns_of, lines_of
@@ -30,7 +31,8 @@ SUFFIXES = (".png", ".pdf", ".svg")
 class Curve:
     """A run's points in one panel: (step, accuracy %, interval %, splits behind it), by rising step.
 
-    A network without steps (an encoder, random weights) has one point of step None: a level.
+    A network without steps (an encoder, random weights), or with one that was chosen for every split, has one point of
+    step None: a level.
     """
 
     label: str
@@ -41,13 +43,18 @@ def curves_of(found: Sequence[FoundRow], labels: Mapping[str, str] | None = None
     """(ways, shots) -> the curves of all runs, means over the table's splits where there are some.
 
     Raises:
-        UsageError: rows of two protocols, duplicates, or no row of a checkpoint.
+        UsageError: rows of two protocols, duplicates, no row of a checkpoint (other than chosen ones), or steps of one
+            curve that were measured on different splits.
     """
     check_no_duplicates(found)
     check_one_protocol(found)
-    if all(item.row.step is None for item in found):
+    if all(_is_level(item.row) for item in found):
         what = "no row is of a checkpoint, so that there is no training to plot against"
-        raise UsageError(what, where="--plot", remedy="`dope eval RUN/checkpoints/step-XXXXXXXX.pt SHARDS` adds a row")
+        remedy = "`dope eval RUN/checkpoints/step-XXXXXXXX.pt SHARDS` adds a row"
+        if any(item.row.chosen_by for item in found):
+            what = "these checkpoints were chosen for each split, so that there is no training to plot against"
+            remedy = f"--part val has all checkpoints; {remedy}"
+        raise UsageError(what, where="--plot", remedy=remedy)
     lines = lines_of(found, labels or {}, by_step=False)
     return {column: [curve for line in lines if (curve := _curve(line, column)).points] for column in columns_of(found)}
 
@@ -99,7 +106,8 @@ def _curve(line: Line, column: tuple[int, int]) -> Curve:
     by_step: dict[int | None, list[FoundRow]] = defaultdict(list)
     for item in line.found:
         if (item.row.ways, item.row.shots) == column:
-            by_step[item.row.step].append(item)
+            by_step[None if _is_level(item.row) else item.row.step].append(item)
+    _check_splits(line.label, by_step)
     points = []
     for step in sorted(by_step, key=lambda step: -1 if step is None else step):
         rows = [item.row for item in by_step[step]]
@@ -109,6 +117,21 @@ def _curve(line: Line, column: tuple[int, int]) -> Curve:
         accuracy, ci95 = (math.fsum(getattr(row, name) for row in rows) / len(rows) for name in ("accuracy", "ci95"))
         points.append((step, 100 * accuracy, 100 * ci95, len(rows)))
     return Curve(line.label, tuple(points))
+
+
+def _is_level(row: ResultRow) -> bool:
+    return row.step is None or bool(row.chosen_by)
+
+
+def _check_splits(label: str, by_step: Mapping[int | None, Sequence[FoundRow]]) -> None:
+    """Refuse a curve that would rise and fall with the classes that its points were measured on."""
+    splits = {step: sorted({item.row.table_split for item in found}) for step, found in by_step.items()}
+    (one, first), *others = splits.items() if splits else [(None, [])]
+    for other, there in others:
+        if there != first:
+            told = (f"{', '.join(map(str, n))} at step {step}" for step, n in ((one, first), (other, there)))
+            what = f"'{label}' was measured on splits {' and '.join(told)}, whose means are no curve"
+            raise UsageError(what, where="--plot", remedy="Choose one by --only table_split=N, or evaluate the others")
 
 
 def _draw(axis: Axes, curve: Curve, number: int) -> Any:

@@ -18,7 +18,7 @@ SHARED = (
 SHARED_IN_CELL = ("queries", "n_classes", "n_objects", "n_views")
 """Columns that are equal for one (ways, shots) of one table split: `--fit` may have reduced the queries of some."""
 MEANINGS = {
-    "evaluation_hash": "categories, image size, matching or support copies",
+    "evaluation_hash": "categories, image size or matching; in rows of earlier versions support copies, too",
     "dataset": "fingerprint of the views",
     "split": "split of the shards",
 }
@@ -28,7 +28,7 @@ MEANINGS = {
 def check_one_protocol(found: Sequence[FoundRow]) -> None:
     """Refuse rows that were not measured in the same way.
 
-    The classifier is a method's own (local matching, logistic regression, ...) and may differ.
+    The classifier is a method's own (local matching, logistic regression with copies of the shots, ...) and may differ.
 
     Raises:
         UsageError: names two files, the columns in which they differ and their values, and how to choose.

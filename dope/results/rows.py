@@ -11,9 +11,6 @@ from dope.lowshot.results import ResultRow
 from dope.results import paper
 from dope.results.sources import FoundRow
 
-CLASSIFIERS = {"local": "local matching", "centroid": "nearest centroid", "nearest": "1-NN", "logistic": "logistic"}
-"""Their names in tables; others stay as they are."""
-
 
 @dataclass(frozen=True)
 class Line:
@@ -23,12 +20,14 @@ class Line:
         label: what it is called; no two lines of a table have the same one.
         method: of its rows; "" where they are of several.
         classifier: in words; "" where they are of several.
+        chosen: whether validation classes chose its checkpoints (`dope eval --select`).
         found: its rows.
     """
 
     label: str
     method: str
     classifier: str
+    chosen: bool
     found: tuple[FoundRow, ...]
 
 
@@ -36,8 +35,8 @@ def lines_of(found: Sequence[FoundRow], labels: Mapping[str, str], *, by_step: b
     """Put rows together that are one line, in the order in which they were found.
 
     A line is a network trained once (a run) or an encoder, by one classifier. Its label is the method, with the run's
-    name where several runs share the method. Of a run with several checkpoints that were measured in the same cell,
-    each is a line (`by_step`); checkpoints chosen for a split each (paper section 4) are one.
+    name where several runs share the method. Of a run with several checkpoints, each is a line (`by_step`); those that
+    were chosen for a split each (paper section 4) are one, apart from the same ones unchosen.
 
     Args:
         found: rows of one protocol.
@@ -51,7 +50,8 @@ def lines_of(found: Sequence[FoundRow], labels: Mapping[str, str], *, by_step: b
     networks: dict[tuple[object, ...], list[FoundRow]] = defaultdict(list)
     for item in found:
         row = item.row
-        networks[(row.method, _trained_once(item), row.config_hash, row.network, row.classifier)].append(item)
+        by = (row.classifier, row.support_copies, row.chosen_by)
+        networks[(row.method, _trained_once(item), row.config_hash, row.network, *by)].append(item)
     _check_labels(labels, found)
     parts = [part for items in networks.values() for part in (_by_checkpoint(items) if by_step else [items])]
     lines: dict[tuple[str, int], list[FoundRow]] = defaultdict(list)
@@ -104,11 +104,14 @@ def _trained_once(item: FoundRow) -> str:
 
 
 def _by_checkpoint(items: list[FoundRow]) -> list[list[FoundRow]]:
-    """The rows apart by their step where a cell has several, else together."""
-    if max(Counter(cell_of(item.row) for item in items).values()) == 1:
-        return [items]
+    """The rows apart by their step, unless there is one for each split of a table, as where they were chosen.
+
+    Rows of earlier versions do not say whether they were.
+    """
     steps = sorted({-1 if item.row.step is None else item.row.step for item in items})
-    if len(steps) == 1:
+    splits = {(item.row.table_split, item.row.step) for item in items}
+    once = max(Counter(cell_of(item.row) for item in items).values()) == 1
+    if len(steps) == 1 or items[0].row.chosen_by or (once and len(splits) == len({split for split, _ in splits})):
         return [items]
     return [[i for i in items if (-1 if i.row.step is None else i.row.step) == step] for step in steps]
 
@@ -122,6 +125,7 @@ class _Facts:
     run: str
     network: str
     classifier: str
+    chosen: str
     step: str
     folder: str
     settings: str
@@ -148,14 +152,16 @@ def _names(parts: Sequence[Sequence[FoundRow]], labels: Mapping[str, str]) -> tu
 
 def _facts(part: Sequence[FoundRow], labels: Mapping[str, str]) -> _Facts:
     item, row = part[0], part[0].row
+    several = row.chosen_by or row.step is None or len({item.row.step for item in part}) > 1
     given = next((labels[name] for name in _handles(item) if name in labels), None)
     return _Facts(
         base=given or paper.method_name(row.method),
         given=given is not None,
         run=row.run or item.run.name,
         network=row.network,
-        classifier=CLASSIFIERS.get(row.classifier, row.classifier),
-        step="" if row.step is None or len({item.row.step for item in part}) > 1 else f"step {row.step:,}",
+        classifier=row.classifier_in_words,
+        chosen="chosen on validation classes" if row.chosen_by else "",
+        step="" if several else f"step {row.step:,}",
         folder=str(item.run),
         settings=f"settings {row.config_hash[:8]}",
         weights=f"weights {str(row.checkpoint_sha256)[:8]}",
@@ -170,6 +176,7 @@ def _details(fact: _Facts, alike: Sequence[_Facts]) -> list[str]:
     details = [fact.run] if not fact.given and len({other.run for other in alike}) > 1 else []
     details += ["untrained"] if fact.network == "untrained" else []
     details += [fact.classifier] if len({other.classifier for other in same_network}) > 1 else []
+    details += [fact.chosen] if fact.chosen and len({other.chosen for other in same_classifier}) > 1 else []
     details += [fact.step] if len({other.step for other in same_classifier}) > 1 and fact.step else []
     return details
 
@@ -205,11 +212,6 @@ def _check_cells(line: Line) -> None:
 
 def _line(name: str, items: Sequence[FoundRow]) -> Line:
     methods = {item.row.method for item in items}
-    classifiers = {CLASSIFIERS.get(item.row.classifier, item.row.classifier) for item in items}
+    classifiers = {item.row.classifier_in_words for item in items}
     only = [next(iter(values)) if len(values) == 1 else "" for values in (methods, classifiers)]
-    return Line(name, only[0], only[1], tuple(items))
-
-
-def _step(part: Sequence[FoundRow]) -> str:
-    step = part[0].row.step
-    return "" if step is None else f"step {step:,}"
+    return Line(name, only[0], only[1], any(item.row.chosen_by for item in items), tuple(items))

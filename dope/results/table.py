@@ -102,6 +102,7 @@ def build_table(
     caption = [_what_all_share(found), *_reading(measured, n_splits, table)]
     if not with_classifier and (name := next(iter(classifiers))):
         caption.append(f"Classifier: {name}.")
+    caption += _choice(lines)
     if len(blocks) > 1:
         caption.append(f"In the paper ({paper.source()}): its own runs, not ours; - ABC: trained on ABC.")
     return ResultsTable(_title(found), names, tuple(blocks), tuple(caption), n_splits, with_classifier)
@@ -187,6 +188,13 @@ def _what_all_share(found: Sequence[FoundRow]) -> str:
     if fitted:
         said.append(f"fewer ways than asked for in {', '.join(fitted)}")
     return "Accuracy in % ± 95% confidence interval: " + ", ".join(said) + "."
+
+
+def _choice(lines: Sequence[Line]) -> list[str]:
+    """Which lines are of checkpoints that validation classes chose."""
+    chosen = [line.label for line in lines if line.chosen]
+    of = "" if len(chosen) == len(lines) else f" (of {', '.join(chosen)} alone)"
+    return [f"Checkpoints that the validation classes of each split chose{of}."] if chosen else []
 
 
 def _reading(lines: Sequence[TableLine], n_splits: int, table: str) -> list[str]:

@@ -14,7 +14,7 @@ from tiny_views import write_views
 from torch import Tensor, nn
 from typer.testing import CliRunner
 
-from cli import app
+from cli import _explain, app
 from dope.common.errors import BadInput, UsageError
 from dope.encoders.embedder import EncoderEmbedder
 from dope.encoders.load import LoadedEncoder
@@ -106,6 +106,18 @@ def test_wrong_combinations_are_explained(module: str, shards: Path, arguments: 
 def test_features_that_are_not_finite_stop_it(module: str, shards: Path) -> None:
     with pytest.raises(BadInput, match=f"--encoder {module}:nan: dense has values that are not finite"):
         command("eval", shards, "--encoder", f"{module}:nan", *FEW)
+
+
+def test_an_encoders_name_is_printed_as_it_is(
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And not ":zero:" and ":fire:" as pictures."""
+    (tmp_path / "signs.py").write_text("def zero(images):\n    return images.new_zeros(len(images), 4, 8, 8)\n")
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(app, ["eval", str(shards), "--encoder", "signs:zero", *FEW, "--out", "out"])
+    assert done.exit_code == 0 and "--encoder signs:zero: " in done.output, done.output
+    _explain(BadInput("fails", where="--encoder signs:fire"))
+    assert "--encoder signs:fire: fails" in capsys.readouterr().err
 
 
 def rows_of(subject: Any, shards: Path, **options: Any) -> tuple[ResultRow, ...]:

@@ -125,6 +125,7 @@ def test_a_checkpoint_is_compared_with_random_weights_in_the_same_episodes(
     checkpoint = tmp_path / "step-00000003.pt"
     settings = replace(load_config("nano", None, ["data.image_size=32"]), network=NETWORK)
     meta = {"path": str(checkpoint), "sha256": "ab", "step": 3, "config_hash": "cd", "facts": {}, "config": {}}
+    meta["dataset"] = "ef"
     loaded = []
 
     def load(path: Path, device: object) -> tuple[object, nn.Module, dict[str, object]]:
@@ -283,5 +284,7 @@ def test_the_table_fits_a_terminal_and_shows_accuracy_beside_chance() -> None:
     )
     reduced = shown(row(ways=3, shots=5, shot_mode="one_instance"))
     assert "of one object" in reduced and "5-way)" in reduced
+    named = shown(row(method="a[1].py:f"), row(method="[b].py:f"), row(table="[x]", table_split=0))
+    assert "a[1].py:f" in named and "[b].py:f" in named and "[x]" in named
     several = shown(row(), row(classes="instance", n_classes=30))
     assert "30 objects" in several and "10 categories" in several

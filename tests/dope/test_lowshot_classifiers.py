@@ -168,9 +168,11 @@ def test_a_copy_is_a_function_of_view_number_and_seed(shards: Path) -> None:
     np.testing.assert_allclose(plain[:, 0], plain[:, 1])  # nothing is left to differ in
 
 
-def test_the_row_of_support_copies_is_another_measurement(shards: Path) -> None:
+def test_support_copies_are_a_column_and_no_part_of_the_protocol(shards: Path) -> None:
     (one,), (five,) = (run(MeanColour(), shards, "logistic", support_copies=n).rows for n in (1, 5))
-    assert one.evaluation_hash != five.evaluation_hash and one.accuracy != five.accuracy
+    assert (one.support_copies, five.support_copies) == (1, 5) and one.accuracy != five.accuracy
+    assert one.evaluation_hash == five.evaluation_hash
+    assert five.classifier == "logistic" and five.classifier_in_words == "logistic, 5 copies a shot"
 
 
 class Broken(MeanColour):

@@ -83,8 +83,9 @@ def test_the_naive_predictions_are_not_all_the_same_and_have_both_kinds_of_queri
 def test_queries_without_predicted_foreground_are_compared_by_random_cells_and_counted(views: ViewShards) -> None:
     drawn = sample_episodes(views.population(views.select()), ONE)
     network = network_with_masks(1e-3)  # every mask is near 0.5
-    work = Work(views, CONFIG, torch.device("cpu"))
+    work = Work(views, CONFIG, torch.device("cpu"), source="random weights")
     (predicted,) = classify_locally(DopeEmbedder(network, None), [drawn], work)
     np.testing.assert_array_equal(predicted, naive_lowshot.classify(network, views, drawn, CONFIG))
     n = len(np.unique(drawn.query))
-    assert len(work.notes) == 1 and f"{n} of {n} query views have fewer than 6 cells" in work.notes[0]
+    (note,) = work.notes
+    assert note.startswith(f"random weights: {n} of {n} query views have fewer than 6 cells")

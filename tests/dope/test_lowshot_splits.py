@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from dope.common.errors import BadInput, UsageError
-from dope.lowshot.splits import match_categories, paper_table, read_split_file, table_names
+from dope.lowshot.splits import TABLES, match_categories, paper_table, read_split_file, table_names
 
 
 def write(path: Path, value: Any) -> Path:
@@ -52,6 +52,14 @@ def test_a_file_of_ones_own_and_one_of_the_papers_format(tmp_path: Path) -> None
     paper = {"train": {"a": 3}, "val_test": letters}
     table = read_split_file(write(tmp_path / "paper.json", paper))
     assert [(split.val, split.test) for split in table.splits] == [(("b",), ("c", "d")), (("c",), ("b", "d"))]
+
+
+def test_other_splits_under_the_name_of_a_table_of_the_paper_are_refused(tmp_path: Path) -> None:
+    file = write(tmp_path / "co3d_ls.json", GOOD)
+    with pytest.raises(BadInput, match=r"name of the paper's table 'co3d_ls', and other splits"):
+        read_split_file(file)
+    file.write_bytes((TABLES / "co3d_ls.json").read_bytes())
+    assert read_split_file(file) == paper_table("co3d_ls")
 
 
 GOOD: dict[str, Any] = {"base": ["a"], "splits": [{"val": ["b"], "test": ["c"]}]}

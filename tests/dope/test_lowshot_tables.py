@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
+import tiny_results
+import torch
 from tiny_checkpoints import ALONE, CONFIG
 from tiny_views import write_views
 from typer.testing import CliRunner
@@ -19,13 +24,14 @@ from dope.checkpoints import save_checkpoint
 from dope.common.errors import BadInput, UsageError
 from dope.lowshot import results
 from dope.lowshot.episodes import EpisodeConfig
-from dope.lowshot.evaluate import EvaluationConfig, evaluate
+from dope.lowshot.evaluate import Evaluation, EvaluationConfig, evaluate
 from dope.lowshot.results import ResultRow, mean_over_splits, read_rows
 from dope.lowshot.selection import best_checkpoints, evaluate_best
 from dope.lowshot.splits import Split, SplitTable
 from dope.lowshot.tasks import validation_protocol
 from dope.methods import method_of
 from dope.networks import NetworkConfig
+from dope.results.sources import NAMES
 from dope.state import new_state
 
 NETWORK = NetworkConfig(width=0.125, pyramid=8, projector=(8, 4))
@@ -121,7 +127,8 @@ def test_each_split_is_tested_with_the_checkpoint_its_validation_classes_choose(
         assert last in note and "since 5-way needs more classes" in note
         path = run / "checkpoints" / last
         alone = evaluate(path, shards, config(table_splits=(row.table_split,)), table=TABLE).rows
-        assert alone == (row,)
+        assert (replace(alone[0], chosen_by="validation"),) == (row,)
+    assert {row.chosen_by for row in val} == {""}
 
 
 def test_of_equally_good_checkpoints_the_later_is_chosen(run: Path, shards: Path) -> None:
@@ -139,6 +146,27 @@ def test_selection_needs_a_run_with_checkpoints(shards: Path, run: Path, tmp_pat
         evaluate_best(tmp_path, shards, config(), TABLE)
     with pytest.raises(UsageError, match="--compare-untrained"):
         evaluate_best(run, shards, config(compare_untrained=True), TABLE)
+
+
+def test_damaged_and_diverged_checkpoints_are_passed_over_and_said(shards: Path, run: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(run, tmp_path / "my_run"))
+    found = sorted((copy / "checkpoints").glob("*.pt"))
+    found[3].write_bytes(b"damaged")
+    values = torch.load(found[2], weights_only=True)
+    for weights in values["network"].values():
+        if weights.is_floating_point():
+            weights.fill_(torch.nan)
+    torch.save(values, found[2])
+    found[2].with_name(found[2].name + ".sha256").unlink()
+    result = evaluate_best(copy, shards, config(), TABLE)
+    assert {r.step for r in result.rows} == {1, 2} and any("the best of 2 with" in note for note in result.notes)
+    passed = [note for note in result.notes if "was passed over" in note]
+    assert [note.split()[0] for note in passed] == [path.name for path in found[2:]]
+    assert "NaN" in passed[0] and "damaged" in passed[1]
+    for path in found:
+        path.write_bytes(b"damaged")
+    with pytest.raises(BadInput, match=r"none of its 4 checkpoints can be used; step-00000001\.pt: is damaged"):
+        evaluate_best(copy, shards, config(), TABLE)
 
 
 def test_training_classes_with_labels_are_never_tested(
@@ -194,10 +222,50 @@ def test_wrong_flags_are_explained(shards: Path, run: Path, flags: list[str], me
     assert done.exit_code != 0 and message in str(done.exception)
 
 
+def test_what_cannot_be_kept_is_refused_before_it_is_measured(
+    shards: Path, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Evaluation, "measure", None)
+    arguments = ["eval", str(run), str(shards), "--ways", "2", "--queries", "2", "--device", "cpu", "--out"]
+
+    def refused(out: Path) -> str:
+        return str(CliRunner().invoke(app, [*arguments, str(out)]).exception)
+
+    (tmp_path / "file").write_text("")
+    assert f"{tmp_path / 'file'}: is no folder" in refused(tmp_path / "file")
+    for name in NAMES:
+        (tmp_path / "damaged").mkdir(exist_ok=True)
+        (tmp_path / "damaged" / name).write_bytes(b"nonsense")
+        assert str(tmp_path / "damaged" / name) in refused(tmp_path / "damaged")
+        (tmp_path / "damaged" / name).unlink()
+    monkeypatch.setattr("os.access", lambda *_: False)
+    assert "cannot be written to. Name a folder for the results by --out" in refused(tmp_path / "new" / "deep")
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_protocol_given_twice_is_measured_once_and_rows_lie_beside_the_checkpoint(
+    shards: Path, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def evaluated(name: Path) -> list[ResultRow]:
+        flags = ["--ways", "2", "--ways", "2", "--shots", "1", "--queries", "2", "--episodes", "3", "--device", "cpu"]
+        done = CliRunner().invoke(app, ["eval", str(name), str(shards), *flags])
+        assert done.exit_code == 0 and "at least" not in done.output, done.output
+        (file,) = tmp_path.rglob("results.json")
+        assert file.parent == tmp_path / "mine" / "eval"
+        return read_rows(file)
+
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine" / "checkpoints").mkdir(parents=True)
+    for place in (tmp_path / "mine", tmp_path / "mine" / "checkpoints"):
+        shutil.copy(run / "checkpoints" / "step-00000002.pt", place / "net.pt")
+    (one,) = evaluated(Path("mine/net.pt"))
+    assert one.run == "mine" and evaluated(tmp_path / "mine" / "checkpoints" / "net.pt") == [one]
+
+
 def test_old_result_rows_without_the_new_columns_are_read(tmp_path: Path, shards: Path) -> None:
     row = evaluate(None, shards, config(), network=NETWORK).rows[0]
     values = dict(vars(row))
-    for name in ("method", "run", "table", "table_split", "part"):
+    for name in ("method", "run", "table", "table_split", "part", "support_copies", "chosen_by"):
         del values[name]
     (tmp_path / "results.json").write_text(json.dumps([values]))
     (old,) = read_rows(tmp_path / "results.json")
@@ -208,6 +276,19 @@ def test_old_result_rows_without_the_new_columns_are_read(tmp_path: Path, shards
         -1,
         "all",
     )
+    assert (old.support_copies, old.chosen_by) == (1, "")
+    pq.write_table(pa.Table.from_pylist([values]), tmp_path / "results.parquet")
+    assert results.append_rows(tmp_path / "results.parquet", [replace(row, support_copies=5)])[0] == old
+
+
+@pytest.mark.parametrize("suffix", [".parquet", ".json"])
+def test_a_choice_replaces_an_earlier_one_and_nothing_else(tmp_path: Path, suffix: str) -> None:
+    chosen = {"table": "mine", "part": "test", "chosen_by": "validation"}
+    first = [tiny_results.row(0.5, table_split=i, step=10 + i, checkpoint_sha256=str(i), **chosen) for i in range(2)]
+    newest = tiny_results.row(0.4, table_split=0, step=10, checkpoint_sha256="0", table="mine", part="test")
+    later = tiny_results.row(0.6, table_split=0, step=30, checkpoint_sha256="3", **chosen)
+    results.append_rows(tmp_path / f"results{suffix}", [*first, newest])
+    assert results.append_rows(tmp_path / f"results{suffix}", [later]) == [later, first[1], newest]
 
 
 def test_evaluations_that_end_at_once_lose_no_rows(

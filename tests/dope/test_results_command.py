@@ -111,6 +111,26 @@ def test_untrained_networks_and_encoders_are_levels() -> None:
     assert [step for step, *_ in curves[1].points] == [None]
 
 
+def test_checkpoints_chosen_for_each_split_are_a_level_and_no_curve() -> None:
+    table = {"table": "mine", "part": "test"}
+    rows = [row(0.6 + i / 10, step=100 * i, table_split=i, chosen_by="validation", **table) for i in range(2)]
+    chosen = [FoundRow(r, Path("run/eval/results.parquet")) for r in rows]
+    found = [item for i in range(2) for item in training("run", 0.1, table_split=i, **table)]
+    curve, level = curves_of([*found, *chosen])[5, 1]
+    assert len(curve.points) == 3 and "chosen" in level.label
+    np.testing.assert_allclose(level.points[0][1:], [65, 1, 2])
+    assert level.points[0][0] is None
+    with pytest.raises(UsageError, match=r"were chosen for each split.*--part val has all"):
+        curves_of(chosen)
+
+
+def test_points_of_different_splits_are_no_curve() -> None:
+    table = {"table": "mine", "part": "val"}
+    found = [*training("a", 0.1, table_split=0, **table), *training("a", 0.1, (200,), table_split=1, **table)]
+    with pytest.raises(UsageError, match="splits 0 at step 0 and 0, 1 at step 200, whose means are no curve"):
+        curves_of(found)
+
+
 def test_what_cannot_be_one_curve_is_refused() -> None:
     found = [*training("a", 0.1), *training("b", 0.1)]
     with pytest.raises(UsageError, match="'same' has two measurements of 5-way 1-shot at step 0"):

@@ -96,8 +96,9 @@ def test_methods_may_have_classifiers_and_checkpoints_of_their_own(tmp_path: Pat
         row(method="feat", classifier="attention", shots=5, step=7, checkpoint_sha256="b", config_hash="d"),
         row(method="rfs", classifier="logistic", shots=5, queries=10, asked_queries=15),  # fewer by --fit
         row(method="vispe", classifier="centroid"),
+        row(method="rfs", classifier="logistic", support_copies=5, chosen_by="validation"),
     ]
-    check_one_protocol([FoundRow(r, tmp_path) for r in (rows[0], rows[1], rows[3])])
+    check_one_protocol([FoundRow(r, tmp_path) for r in (rows[0], rows[1], *rows[3:])])
     check_one_protocol([FoundRow(r, tmp_path) for r in (rows[0], rows[2])])
     with pytest.raises(UsageError, match="queries: 15 and 10"):
         check_one_protocol([FoundRow(r, tmp_path) for r in rows])

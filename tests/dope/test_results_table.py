@@ -103,6 +103,45 @@ def test_labels_are_no_longer_than_needed() -> None:
     assert labels(row(method="mine:encoder", run="", step=None)) == ["mine:encoder"]
 
 
+def test_rows_with_and_without_copies_of_the_shots_are_lines_of_their_own() -> None:
+    rfs = {"method": "rfs", "classifier": "logistic"}
+    plain, copied = row(**rfs), row(0.6, shots=5, support_copies=5, **rfs)
+    made = table(plain, copied, row(0.7, run="d"))
+    assert list(measured(made)) == ["RFS (logistic)", "RFS (logistic, 5 copies a shot)", "DOPE"]
+    said = as_text(table(copied))
+    assert "Classifier: logistic, 5 copies a shot." in said
+
+
+def test_checkpoints_of_a_run_are_one_line_only_where_each_split_has_its_own() -> None:
+    def lines(*rows: ResultRow) -> list[str]:
+        return list(measured(table(*rows)))
+
+    later = {"step": 200, "checkpoint_sha256": "bb"}
+    assert lines(row(), row(ways=10, **later)) == ["DOPE (step 100)", "DOPE (step 200)"]
+    first, second = row(table_split=0, **MODELNET), row(table_split=1, **later, **MODELNET)
+    assert lines(first, second) == ["DOPE"]
+    other = row(table_split=1, ways=10, **MODELNET)
+    assert lines(first, second, other) == ["DOPE (step 100)", "DOPE (step 200)"]
+
+
+def test_chosen_checkpoints_are_told_from_the_same_ones_unchosen() -> None:
+    def chosen(**columns: object) -> list[ResultRow]:
+        steps = [100, 200, 200, 200, 300]
+        return [row(table_split=i, step=s, checkpoint_sha256=str(s), chosen_by="validation", **MODELNET, **columns)
+                for i, s in enumerate(steps)]  # fmt: skip
+
+    newest = [row(table_split=i, step=300, checkpoint_sha256="300", **MODELNET) for i in range(5)]
+    made = table(*newest, *chosen())
+    assert list(measured(made)) == ["DOPE (step 300)", "DOPE (chosen on validation classes)"]
+    assert all(cells[0] and not cells[0].missing for cells in measured(made).values())
+    said = "Checkpoints that the validation classes of each split chose"
+    assert f"{said} (of DOPE (chosen on validation classes) alone)." in made.caption
+    assert f"{said}." in table(*chosen()).caption and f"{said}." in as_text(table(*chosen())).replace("\n", " ")
+    assert not any(said in sentence for sentence in table(*newest).caption)
+    one = [row(table_split=i, chosen_by="validation", **MODELNET) for i in range(5)]
+    assert list(measured(table(*newest, *one))) == ["DOPE (step 300)", "DOPE (chosen on validation classes)"]
+
+
 def test_runs_of_one_name_in_two_folders_are_told_apart_by_their_folders() -> None:
     rows = [row(run="run", config_hash="1", checkpoint_sha256="a"), row(run="run", config_hash="2")]
     made = build_table([*found(rows[0], folder="x"), *found(rows[1], folder="y")], beside="none")
