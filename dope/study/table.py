@@ -38,7 +38,7 @@ def study_table(pieces: Sequence[Piece], out: Path, also: str | None = None) -> 
     ]
     for variant in variants:
         runs = [found[piece] for piece in pieces if piece.variant == variant]
-        classifiers = sorted({item.row.classifier for run in runs for item in run})
+        classifiers = sorted({item.row.classifier_in_words for run in runs for item in run})
         cells = [_cell([_of_column(run, column) for run in runs]) for column in columns]
         lines.append([variant.label, ", ".join(classifiers), *cells])
     lines.append(["chance", "", *(f"{100 / ways:.1f}" for ways, _ in columns)])

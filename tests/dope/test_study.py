@@ -196,8 +196,8 @@ def test_the_table_has_means_over_seeds_and_how_they_differ(tmp_path: Path) -> N
     assert (tmp_path / "table.md").read_text() == text
     lines = text.splitlines()
     assert lines[0] == "|  | classifier | 5w1s | 10w1s |"
-    assert lines[2] == "| DOPE (2nd view + other objects) | local | 62.0 ± 1.0 (2.8) | 57.0 ± 1.0 (2.8) |"
-    assert lines[3] == "| other objects only | local | 50.0 ± 1.0 (0.0) | 45.0 ± 1.0 (0.0) |"
+    assert lines[2] == "| DOPE (2nd view + other objects) | local matching | 62.0 ± 1.0 (2.8) | 57.0 ± 1.0 (2.8) |"
+    assert lines[3] == "| other objects only | local matching | 50.0 ± 1.0 (0.0) | 45.0 ± 1.0 (0.0) |"
     assert lines[4] == "| chance |  | 20.0 | 10.0 |" and "means over 2 seeds" in text
     append_rows(pieces[0].run / "eval" / "results.parquet", [row(run="dope-seed0", ways=5, shots=5, episodes=7)])
     with pytest.raises(UsageError, match="episodes"):
