@@ -216,7 +216,7 @@ def open_run(shards: Shards, out: Path, config: TrainConfig, ranks: Ranks, resum
             what = "the ranks do not see the same checkpoints"
             raise DopeError(what, where=out / "checkpoints", remedy="All machines must share this folder")
         if found is None:
-            method.start(state.network)
+            state.facts = method.start(state.network, state.facts)
         if ranks.is_first:
             checkpoints.note_origin(resume, out, found)
         yield Run(out, config, ranks, method, dataset, order, held_out, held_out_damaged, state, found, damaged)

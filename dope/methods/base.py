@@ -125,8 +125,13 @@ class Method(ABC):
     def new_network(self, facts: Facts) -> nn.Module:
         """Random weights by torch's global generator, which the caller has seeded."""
 
-    def start(self, network: nn.Module) -> None:  # noqa: B027 - most methods have nothing to do
-        """Take over weights that the settings name, before the first step of a run; its companion is made before."""
+    def start(self, network: nn.Module, facts: Facts) -> Facts:
+        """Take over weights that the settings name, before the first step of a run; its companion is made before.
+
+        Returns:
+            `facts`, with what these weights have learnt from.
+        """
+        return facts
 
     def new_companion(self, network: nn.Module) -> nn.Module:
         """What goes with the network without gradient: a momentum encoder, a queue; its state is in checkpoints."""

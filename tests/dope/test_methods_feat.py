@@ -155,7 +155,7 @@ def begun(config: TrainConfig) -> FeatNetwork:
     """The network of a run before its first step."""
     method = method_of(config)
     network = new_state(method, ALONE).network
-    method.start(network)
+    method.start(network, {})
     assert isinstance(network, FeatNetwork)
     return network
 
