@@ -157,7 +157,7 @@ class Run:
         return result[self.method.score] > checkpoints.best_score(self.out, before=step)
 
     def save(self, log: RunLog | SilentLog, *, is_best: bool = False, hurry: bool = False) -> None:
-        """Write a checkpoint on the first rank; with `hurry`, as after a signal, without what takes minutes."""
+        """Write a checkpoint on the first rank; with `hurry`, after a signal or error, without what takes minutes."""
         if self.ranks.is_first:
             best = self.state.validation[self.method.score] if is_best and self.state.validation else None
             fingerprint = self.dataset.index.fingerprint

@@ -187,7 +187,8 @@ class Method(ABC):
         """What a checkpoint must hold that training itself does not need.
 
         Args:
-            hurry: a signal has stopped the run, which may be killed soon: leave out what takes long, and mark it.
+            hurry: a signal or an error has stopped the run, which may be killed soon: leave out what takes long, and
+                mark it.
         """
 
     @abstractmethod

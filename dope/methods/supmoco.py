@@ -16,6 +16,7 @@ from dope.methods.base import Facts, MeanLoss, Method
 from dope.methods.class_keys import ClassKeys, KeyedOrder
 from dope.methods.data import pair_order, view_dataset
 from dope.methods.queue import NO_CLASS, KeyEncoder, UnitVectors, unit
+from dope.methods.supervised import base_classes
 from dope.methods.vispe_moco import ContrastNetwork, new_key_encoder, shuffle_seed
 from dope.queries import autocast
 from dope.single_views import ImageBatch, ViewDataset
@@ -56,7 +57,7 @@ class SupMoCo(Method):
         return KeyedOrder(pair_order(self.config, dataset), choice, self.config.supmoco.keys, self.config.seed)
 
     def facts(self, dataset: ViewDataset) -> Facts:
-        return {"classes": list(dataset.classes)}
+        return {"classes": base_classes(dataset)}
 
     def new_network(self, facts: Facts) -> ContrastNetwork:
         return ContrastNetwork(self.config.network.width, (None, self.config.supmoco.head))
