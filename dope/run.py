@@ -216,6 +216,7 @@ def open_run(shards: Shards, out: Path, config: TrainConfig, ranks: Ranks, resum
             what = "the ranks do not see the same checkpoints"
             raise DopeError(what, where=out / "checkpoints", remedy="All machines must share this folder")
         if found is None:
+            method.refuse_unread()
             state.facts = method.start(state.network, state.facts)
         if ranks.is_first:
             checkpoints.note_origin(resume, out, found)

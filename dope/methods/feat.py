@@ -106,6 +106,7 @@ class Feat(Method):
     """Few-shot embedding adaptation by a transformer."""
 
     name = "feat"
+    sections = ("feat",)
     own_classifier = "attention"
     pairs = False
     batch_of = "episodes"

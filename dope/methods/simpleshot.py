@@ -42,6 +42,7 @@ class SimpleShot(Supervised):
     """Cross entropy on the base classes; nearest class means of centred, unit features."""
 
     name = "simpleshot"
+    sections = ("simpleshot",)
     own_classifier = "cl2n"
 
     _mean_is_of: str = ""

@@ -39,6 +39,7 @@ class SupMoCo(Method):
     """Momentum contrast with labels."""
 
     name = "supmoco"
+    sections = ("supmoco",)
     own_classifier = "logistic"
     pairs = False
     batch_of = "views"

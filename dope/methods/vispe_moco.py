@@ -43,6 +43,7 @@ class VispeMoCo(PairMethod):
     """Momentum contrast between two views of an object."""
 
     name = "vispe_moco"
+    sections = ("moco",)
     own_classifier = "nearest"
 
     def new_network(self, facts: Facts) -> ContrastNetwork:

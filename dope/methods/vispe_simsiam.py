@@ -58,6 +58,7 @@ class VispeSimSiam(PairMethod):
     """Siamese prediction between two views of an object."""
 
     name = "vispe_simsiam"
+    sections = ("simsiam",)
     own_classifier = "nearest"
 
     def new_network(self, facts: Facts) -> SimSiamNetwork:

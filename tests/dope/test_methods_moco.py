@@ -24,6 +24,7 @@ from dope.methods.vispe_moco import moco_loss
 from dope.networks.batchnorm import batchnorms
 from dope.order import Place
 from dope.state import new_state
+from dope.trainer import train
 
 ALONE = Ranks(0, 1, torch.device("cpu"))
 
@@ -177,6 +178,20 @@ def test_retrieval_counts_pairs_that_find_their_own_second_view() -> None:
 def test_local_negatives_are_refused() -> None:
     with pytest.raises(UsageError, match=r"distributed.local_negatives: cannot be used by vispe_moco"):
         method_of(tiny_method("vispe_moco", "distributed.local_negatives=true"))
+
+
+def test_settings_of_other_methods_are_refused(shards: Path, tmp_path: Path) -> None:
+    for method, setting, instead in (
+        ("vispe_moco", "loss.temperature=0.5", "Did you mean moco.temperature?"),
+        ("vispe_moco", "supmoco.queue=8", "Did you mean moco.queue?"),
+        ("vispe", "loss.negatives=second_view", "Leave out loss.negatives"),
+        ("vispe", "network.predict_mask=false", "Leave out network.predict_mask"),
+        ("dope", "moco.temperature=0.5", "Did you mean loss.temperature?"),
+    ):
+        with pytest.raises(UsageError, match=rf"^{setting.split('=')[0]}: is not read by {method}\. .*") as error:
+            train(shards, tmp_path / method, tiny_method(method, setting))
+        assert instead in str(error.value)
+        assert not (tmp_path / method / "config.yaml").exists()
 
 
 def test_settings_that_make_no_sense_are_refused() -> None:
