@@ -130,10 +130,14 @@ class Feat(Method):
 
     def start(self, network: nn.Module, facts: Facts) -> Facts:
         assert isinstance(network, FeatNetwork)
-        if not self.config.feat.start:
+        feat = self.config.feat
+        if feat.shots > 1 and feat.balance == FeatConfig.balance:
+            what = "feat.shots=%d with the paper's feat.balance of 1 shot; for 5 it is 0.1, feat.centre_temperature %g"
+            logger.warning(what, feat.shots, feat.temperature / 2)
+        if not feat.start:
             logger.warning("feat.start names no run of SimpleShot or RFS: the encoder begins with random weights")
             return facts
-        known = take_encoder(network, Path(self.config.feat.start), self.config.network.width)
+        known = take_encoder(network, Path(feat.start), self.config.network.width)
         return {**facts, "classes": sorted({*facts.get("classes", ()), *known})}
 
     def online(self, network: nn.Module) -> OnlineFeat:

@@ -15,7 +15,7 @@ from dope.distributed import Ranks
 from dope.methods.base import Facts, MeanLoss, Method
 from dope.methods.class_keys import ClassKeys, KeyedOrder
 from dope.methods.data import pair_order, view_dataset
-from dope.methods.queue import NO_CLASS, KeyEncoder, UnitVectors, unit
+from dope.methods.queue import NO_CLASS, KeyEncoder, UnitVectors, spread, unit
 from dope.methods.supervised import base_classes
 from dope.methods.vispe_moco import ContrastNetwork, new_key_encoder, shuffle_seed
 from dope.queries import autocast
@@ -99,7 +99,8 @@ class SupMoCo(Method):
             self.config.supmoco.temperature,
         )
         n = ranks.sum(counted.sum()).clamp(min=1)
-        return MeanLoss.of(each.masked_fill(~counted, 0).sum() * ranks.world / n, ranks, stop)
+        total = each.masked_fill(~counted, 0).sum() * ranks.world / n
+        return MeanLoss.of(total, ranks, stop, spread=spread(keys))
 
     def after_step(self, network: nn.Module, companion: Any) -> None:
         companion.update(network)

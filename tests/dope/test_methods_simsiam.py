@@ -18,7 +18,8 @@ from dope.config import load_config
 from dope.distributed import Ranks
 from dope.methods import method_of
 from dope.methods.configs import SimSiamConfig
-from dope.methods.vispe_simsiam import SimSiamNetwork, negative_cosine, spread
+from dope.methods.queue import spread
+from dope.methods.vispe_simsiam import SimSiamNetwork, negative_cosine
 from dope.state import highest_rate, learning_rate, new_state, set_learning_rate
 from dope.trainer import train
 
