@@ -233,6 +233,7 @@ def resume(path: Path, state: TrainState, method: Method, dataset: str) -> None:
     state.step, state.place = values["step"], Place(values["epoch"], values["samples_consumed"])
     state.validation, state.untrained = values["validation"], values["untrained"]
     state.damaged = set(values.get("damaged", ()))
+    state.facts = values.get("facts", state.facts)
 
 
 def resume_newest(run: Path, state: TrainState, method: Method, dataset: str) -> tuple[Path | None, list[BadInput]]:

@@ -91,6 +91,8 @@ class OptimiserConfig:
 
     lr: float = 1e-4
     """Highest learning rate."""
+    lr_batch: int = 0
+    """data.batch_size that `lr` is for: with another one it becomes lr * data.batch_size / this; 0 = it stays."""
     weight_decay: float = 1e-2
     """Decoupled weight decay."""
     betas: tuple[float, float] = (0.9, 0.999)

@@ -84,6 +84,7 @@ def _rules(config: TrainConfig) -> tuple[Rule, ...]:
         ("loss.mask_weight", loss.mask_weight >= 0, "must not be negative"),
         ("loss.chunk", loss.chunk >= 1, "must be at least 1"),
         ("optimiser.lr", optimiser.lr > 0, "must be positive"),
+        ("optimiser.lr_batch", optimiser.lr_batch >= 0, "must not be negative"),
         ("optimiser.weight_decay", optimiser.weight_decay >= 0, "must not be negative"),
         ("optimiser.betas", all(0 <= beta < 1 for beta in optimiser.betas), "must lie in [0, 1)"),
         ("optimiser.momentum", 0 <= optimiser.momentum < 1, "must lie in [0, 1)"),

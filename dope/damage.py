@@ -24,7 +24,7 @@ def heed(run: Run, stop: bool, batch: PairBatch, log: RunLog | SilentLog) -> boo
     for rank, (_, some, whole_share) in enumerate(said):
         if whole_share:
             if run.state.step:
-                run.save(log)  # as in `count`
+                run.save(log, hurry=True)  # as in `count`
             raise BadInput(
                 f"all {len(some)} samples of rank {rank} at step {run.state.step} are damaged, the first one: "
                 f"{some[0].reason}",
@@ -46,7 +46,9 @@ def count(run: Run, samples: list[DamagedSample], log: RunLog | SilentLog) -> No
         log.say(f"damaged sample {sample.key} of {sample.shard}: {sample.reason} ({len(known)} of at most {limit})")
     if len(known) > limit:
         if run.state.step:
-            run.save(log)  # nothing is lost for one who goes on with a higher limit
+            # nothing is lost for one who goes on with a higher limit. The other ranks end at once, and soon after them
+            # the first one is ended: it would not come to an end with what takes minutes
+            run.save(log, hurry=True)
         storage, what = run.dataset.index.storage, f"{len(known)} damaged, data.max_bad_samples is {limit}"
         newest = samples[-1] if samples else None  # none: they were met before, under a higher limit
         raise BadInput(

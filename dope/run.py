@@ -157,7 +157,7 @@ class Run:
         return result[self.method.score] > checkpoints.best_score(self.out, before=step)
 
     def save(self, log: RunLog | SilentLog, *, is_best: bool = False, hurry: bool = False) -> None:
-        """Write a checkpoint on the first rank; with `hurry`, as after a signal, without what takes minutes."""
+        """Write a checkpoint on the first rank; with `hurry`, after a signal or error, without what takes minutes."""
         if self.ranks.is_first:
             best = self.state.validation[self.method.score] if is_best and self.state.validation else None
             fingerprint = self.dataset.index.fingerprint
@@ -216,7 +216,8 @@ def open_run(shards: Shards, out: Path, config: TrainConfig, ranks: Ranks, resum
             what = "the ranks do not see the same checkpoints"
             raise DopeError(what, where=out / "checkpoints", remedy="All machines must share this folder")
         if found is None:
-            method.start(state.network)
+            method.refuse_unread()
+            state.facts = method.start(state.network, state.facts)
         if ranks.is_first:
             checkpoints.note_origin(resume, out, found)
         yield Run(out, config, ranks, method, dataset, order, held_out, held_out_damaged, state, found, damaged)

@@ -105,9 +105,15 @@ def total_steps(config: TrainConfig, steps_per_epoch: int) -> int:
     return min(steps, config.schedule.max_steps) if config.schedule.max_steps else steps
 
 
+def highest_rate(config: TrainConfig) -> float:
+    """The highest learning rate of a run, for its batch size."""
+    optimiser = config.optimiser
+    return optimiser.lr * (config.data.batch_size / optimiser.lr_batch if optimiser.lr_batch else 1)
+
+
 def learning_rate(config: TrainConfig, step: int, steps_per_epoch: int) -> float:
     """The learning rate of step `step` (from 0): linear warm-up, then cosine to 0, constant, or falling in steps."""
-    schedule, peak = config.schedule, config.optimiser.lr
+    schedule, peak = config.schedule, highest_rate(config)
     if step < schedule.warmup_steps:
         return peak * (step + 1) / (schedule.warmup_steps + 1)
     if schedule.shape == "constant":

@@ -16,7 +16,7 @@ from dope.memory import MemoryWatch
 from dope.meter import Meter
 from dope.profiling import StepProfiler
 from dope.run import open_run
-from dope.state import learning_rate, set_learning_rate, wrap
+from dope.state import highest_rate, learning_rate, set_learning_rate, wrap
 from dope.stop_signals import StopRequest
 from dope.storage import Shards
 from dope.streaming import PairLoader
@@ -73,7 +73,7 @@ def train(
             stopping = state.step >= last_step
             for batch in meter.waiting_for(loader) if not stopping else ():
                 lr = learning_rate(config, state.step, run.order.steps_per_epoch)
-                set_learning_rate(state.optimiser, lr, config.optimiser.lr)
+                set_learning_rate(state.optimiser, lr, highest_rate(config))
                 prepared = method.prepare(batch.to(ranks.device), state.step, share)
                 news = stop.requested or bool(batch.damaged)
                 with MemoryWatch(online, ranks.device) if state.step == meter.first_step else nullcontext() as memory:

@@ -14,7 +14,9 @@ import torch
 from torch import Tensor, nn
 
 from dope.augmentation import WHOLE, Share
+from dope.common import settings
 from dope.common.errors import UsageError
+from dope.config_rules import flat
 from dope.distributed import Ranks
 from dope.order import Place
 
@@ -22,6 +24,11 @@ if TYPE_CHECKING:
     from dope.config import TrainConfig
     from dope.lowshot.embedding import Embedder
     from dope.storage import Shards
+
+OF_SOME_METHODS = ("loss", "simpleshot", "feat", "supmoco", "vispe", "moco", "simsiam")
+"""Sections of the settings that only some methods read (`Method.sections`)."""
+OF_DOPE = ("network.predict_mask",)
+"""Settings in sections that all methods read, and that only DOPE reads."""
 
 Facts = dict[str, Any]
 """What a network's shape takes from its data (e.g. the base classes); kept in checkpoints."""
@@ -91,6 +98,8 @@ class Method(ABC):
     """Whether it learns from view pairs; else from single views and their classes."""
     batch_of: ClassVar[str] = "pairs"
     """What data.batch_size counts: pairs, views or episodes."""
+    sections: ClassVar[tuple[str, ...]] = ()
+    """Sections of the settings that it reads and not all methods do."""
     score: ClassVar[str]
     """What `validate` measures and the best checkpoint is chosen by: pck, retrieval or accuracy, in [0, 1]."""
 
@@ -125,8 +134,13 @@ class Method(ABC):
     def new_network(self, facts: Facts) -> nn.Module:
         """Random weights by torch's global generator, which the caller has seeded."""
 
-    def start(self, network: nn.Module) -> None:  # noqa: B027 - most methods have nothing to do
-        """Take over weights that the settings name, before the first step of a run; its companion is made before."""
+    def start(self, network: nn.Module, facts: Facts) -> Facts:
+        """Take over weights that the settings name, before the first step of a run; its companion is made before.
+
+        Returns:
+            `facts`, with what these weights have learnt from.
+        """
+        return facts
 
     def new_companion(self, network: nn.Module) -> nn.Module:
         """What goes with the network without gradient: a momentum encoder, a queue; its state is in checkpoints."""
@@ -182,12 +196,30 @@ class Method(ABC):
         """What a checkpoint must hold that training itself does not need.
 
         Args:
-            hurry: a signal has stopped the run, which may be killed soon: leave out what takes long, and mark it.
+            hurry: a signal or an error has stopped the run, which may be killed soon: leave out what takes long, and
+                mark it.
         """
 
     @abstractmethod
     def embedder(self, network: nn.Module) -> Embedder:
         """The network as evaluation sees it."""
+
+    def refuse_unread(self) -> None:
+        """Raise `UsageError` for a changed setting of other methods, which would change nothing, not even the loss."""
+        from dope.config import TrainConfig
+
+        values, plain = (flat(settings.to_dict(config)) for config in (self.config, TrainConfig()))
+        own = [f"{section}." for section in self.sections]
+        for key, value in values.items():
+            section, _, name = key.rpartition(".")
+            others = section in OF_SOME_METHODS and section not in self.sections
+            if value != plain[key] and (others or (key in OF_DOPE and self.name != "dope")):
+                instead = next((own_key for prefix in own if (own_key := prefix + name) in values), None)
+                raise UsageError(
+                    f"is not read by {self.name}",
+                    where=key,
+                    remedy=f"Did you mean {instead}?" if instead else f"Leave out {key}, or train another --method",
+                )
 
     def refuse(self, setting: str, wrong: bool, reason: str) -> None:
         """Raise `UsageError` for a setting that this method cannot use."""

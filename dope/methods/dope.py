@@ -27,6 +27,7 @@ class Dope(Method):
     """Dense object descriptors."""
 
     name = "dope"
+    sections = ("loss",)
     own_classifier = "local"
     has_dense = True
     score = "pck"

@@ -106,6 +106,7 @@ class Feat(Method):
     """Few-shot embedding adaptation by a transformer."""
 
     name = "feat"
+    sections = ("feat",)
     own_classifier = "attention"
     pairs = False
     batch_of = "episodes"
@@ -127,12 +128,17 @@ class Feat(Method):
     def new_network(self, facts: Facts) -> FeatNetwork:
         return FeatNetwork(self.config.network.width)
 
-    def start(self, network: nn.Module) -> None:
+    def start(self, network: nn.Module, facts: Facts) -> Facts:
         assert isinstance(network, FeatNetwork)
-        if not self.config.feat.start:
+        feat = self.config.feat
+        if feat.shots > 1 and feat.balance == FeatConfig.balance:
+            what = "feat.shots=%d with the paper's feat.balance of 1 shot; for 5 it is 0.1, feat.centre_temperature %g"
+            logger.warning(what, feat.shots, feat.temperature / 2)
+        if not feat.start:
             logger.warning("feat.start names no run of SimpleShot or RFS: the encoder begins with random weights")
-            return
-        take_encoder(network, Path(self.config.feat.start), self.config.network.width)
+            return facts
+        known = take_encoder(network, Path(feat.start), self.config.network.width)
+        return {**facts, "classes": sorted({*facts.get("classes", ()), *known})}
 
     def online(self, network: nn.Module) -> OnlineFeat:
         assert isinstance(network, FeatNetwork)
@@ -263,8 +269,11 @@ def held_out_episodes(
         return None
 
 
-def take_encoder(network: FeatNetwork, path: Path, width: float) -> None:
+def take_encoder(network: FeatNetwork, path: Path, width: float) -> list[str]:
     """Begin with the encoder of a checkpoint of SimpleShot or RFS.
+
+    Returns:
+        The classes whose labels it has learnt from, which are no new ones to this network either.
 
     Raises:
         BadInput: no checkpoint there, or it cannot be read.
@@ -283,3 +292,4 @@ def take_encoder(network: FeatNetwork, path: Path, width: float) -> None:
         raise UsageError(what, where=where, remedy=f"Use --set network.width={theirs}")
     assert isinstance(trained, ClassifierNetwork)
     network.encoder.load_state_dict(trained.encoder.state_dict())
+    return list(meta["facts"]["classes"])

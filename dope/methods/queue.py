@@ -134,3 +134,11 @@ class UnitVectors(nn.Module):
 def unit(vectors: Tensor) -> Tensor:
     """Vectors (B, D) at length 1, float32 at least."""
     return F.normalize(vectors.to(torch.promote_types(vectors.dtype, torch.float32)), dim=1)
+
+
+def spread(vectors: Tensor) -> Tensor:
+    """How far vectors (B, D) differ in direction: the mean over dimensions of the deviation of unit vectors over the
+    batch, times the root of D; 1 where they are spread evenly, 0 where all are one, the collapse to look out for
+    (SimSiam, section 4.1)."""
+    directions = unit(vectors)
+    return directions.std(0, correction=0).mean() * directions.shape[1] ** 0.5

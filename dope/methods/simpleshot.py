@@ -29,7 +29,7 @@ logger = logging.getLogger(__name__)
 
 class SimpleShotNetwork(ClassifierNetwork):
     """The classifier, and `mean` (dim,): the mean feature of all base training images, in checkpoints that of their own
-    weights. Zero before the first one; NaN in a checkpoint that a signal asked for, as it takes all images to make."""
+    weights. Zero before the first one; NaN where the run was stopped at it, as it takes all images to make."""
 
     mean: Tensor
 
@@ -42,6 +42,7 @@ class SimpleShot(Supervised):
     """Cross entropy on the base classes; nearest class means of centred, unit features."""
 
     name = "simpleshot"
+    sections = ("simpleshot",)
     own_classifier = "cl2n"
 
     _mean_is_of: str = ""
@@ -94,7 +95,7 @@ class SimpleShotEmbedder(PooledEmbedder):
         mean = self.mean.cpu().numpy()
         if self.transform == "cl2n" and not np.isfinite(mean).all():
             raise UsageError(
-                "this checkpoint has no mean feature of the base images: a signal stopped the run before it was made",
+                "this checkpoint has no mean feature of the base images: the run was stopped before it was made",
                 where="--classifier cl2n",
                 remedy="Go on with the run (`dope train`, the same command), or use --classifier centroid",
             )

@@ -15,7 +15,8 @@ from dope.distributed import Ranks
 from dope.methods.base import Facts, MeanLoss, Method
 from dope.methods.class_keys import ClassKeys, KeyedOrder
 from dope.methods.data import pair_order, view_dataset
-from dope.methods.queue import NO_CLASS, KeyEncoder, UnitVectors, unit
+from dope.methods.queue import NO_CLASS, KeyEncoder, UnitVectors, spread, unit
+from dope.methods.supervised import base_classes
 from dope.methods.vispe_moco import ContrastNetwork, new_key_encoder, shuffle_seed
 from dope.queries import autocast
 from dope.single_views import ImageBatch, ViewDataset
@@ -38,6 +39,7 @@ class SupMoCo(Method):
     """Momentum contrast with labels."""
 
     name = "supmoco"
+    sections = ("supmoco",)
     own_classifier = "logistic"
     pairs = False
     batch_of = "views"
@@ -56,7 +58,7 @@ class SupMoCo(Method):
         return KeyedOrder(pair_order(self.config, dataset), choice, self.config.supmoco.keys, self.config.seed)
 
     def facts(self, dataset: ViewDataset) -> Facts:
-        return {"classes": list(dataset.classes)}
+        return {"classes": base_classes(dataset)}
 
     def new_network(self, facts: Facts) -> ContrastNetwork:
         return ContrastNetwork(self.config.network.width, (None, self.config.supmoco.head))
@@ -97,7 +99,8 @@ class SupMoCo(Method):
             self.config.supmoco.temperature,
         )
         n = ranks.sum(counted.sum()).clamp(min=1)
-        return MeanLoss.of(each.masked_fill(~counted, 0).sum() * ranks.world / n, ranks, stop)
+        total = each.masked_fill(~counted, 0).sum() * ranks.world / n
+        return MeanLoss.of(total, ranks, stop, spread=spread(keys))
 
     def after_step(self, network: nn.Module, companion: Any) -> None:
         companion.update(network)

@@ -24,6 +24,7 @@ class Vispe(PairMethod):
     """View-invariant features by instance discrimination and a divergence between views."""
 
     name = "vispe"
+    sections = ("vispe",)
     own_classifier = "centroid"
 
     def new_network(self, facts: Facts) -> PooledNetwork:

@@ -15,7 +15,7 @@ from dope.distributed import Ranks
 from dope.methods.base import Facts, MeanLoss
 from dope.methods.pairs import PairMethod
 from dope.methods.pooled import PooledNetwork
-from dope.methods.queue import KeyEncoder, KeyQueue, UnitVectors
+from dope.methods.queue import KeyEncoder, KeyQueue, UnitVectors, spread
 from dope.queries import autocast
 
 
@@ -43,6 +43,7 @@ class VispeMoCo(PairMethod):
     """Momentum contrast between two views of an object."""
 
     name = "vispe_moco"
+    sections = ("moco",)
     own_classifier = "nearest"
 
     def new_network(self, facts: Facts) -> ContrastNetwork:
@@ -67,7 +68,7 @@ class VispeMoCo(PairMethod):
             (queries,) = online(batch.images1)
         companion.remember(keys)
         loss = moco_loss(queries, ranks.share(keys), companion.queue.keys, self.config.moco.temperature)
-        return MeanLoss.of(loss, ranks, stop)
+        return MeanLoss.of(loss, ranks, stop, spread=spread(keys))
 
     def after_step(self, network: nn.Module, companion: Any) -> None:
         companion.update(network)

@@ -15,7 +15,7 @@ from dope.methods.base import Facts, MeanLoss
 from dope.methods.configs import SimSiamConfig
 from dope.methods.pairs import PairMethod
 from dope.methods.pooled import PooledNetwork
-from dope.methods.queue import unit
+from dope.methods.queue import spread, unit
 from dope.networks import compiling
 from dope.queries import autocast
 
@@ -58,6 +58,7 @@ class VispeSimSiam(PairMethod):
     """Siamese prediction between two views of an object."""
 
     name = "vispe_simsiam"
+    sections = ("simsiam",)
     own_classifier = "nearest"
 
     def new_network(self, facts: Facts) -> SimSiamNetwork:
@@ -94,13 +95,6 @@ class VispeSimSiam(PairMethod):
 def negative_cosine(predictions: Tensor, projections: Tensor) -> Tensor:
     """-cosine, mean over rows (B, D); no gradient goes to the projections (SimSiam, equations 1 and 3)."""
     return -(unit(predictions) * unit(projections.detach())).sum(1).mean()
-
-
-def spread(projections: Tensor) -> Tensor:
-    """How far unit projections (B, D) differ: the mean over dimensions of their deviation over the batch, times the
-    root of D; 1 where they are spread evenly, 0 where all are one, the collapse to look out for (section 4.1)."""
-    vectors = unit(projections)
-    return vectors.std(0, correction=0).mean() * vectors.shape[1] ** 0.5
 
 
 def _layer(inputs: int, outputs: int) -> list[nn.Module]:

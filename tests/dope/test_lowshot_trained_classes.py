@@ -42,3 +42,20 @@ def test_trained_classes_are_told_and_in_a_table_refused(shards: Path, tmp_path:
     leaking = SplitTable("mine", (), (Split(("ring",), ("disc", "square")),))
     with pytest.raises(UsageError, match="was trained with the labels of disc, which split 0 of mine tests"):
         evaluate(run, shards, PROTOCOL, table=leaking)
+
+
+def test_feat_knows_the_classes_that_its_encoder_was_trained_with(shards: Path, tmp_path: Path) -> None:
+    torch.set_num_threads(1)
+    train(shards, tmp_path / "start", load_config("nano", None, SMALL, method="simpleshot"))
+    others = [
+        *SMALL, "data.batch_size=1", 'data.categories=["ring", "square"]', "feat.ways=2", "feat.queries=2",
+        "schedule.max_steps=2", f"feat.start={tmp_path / 'start'}",
+    ]  # fmt: skip
+    for _ in range(2):  # and still does when it has been stopped
+        train(shards, tmp_path / "run", load_config("nano", None, others, method="feat"), stop_after=1)
+        run = find_checkpoint(tmp_path / "run")
+        note = "learnt with the labels of bar, disc, ring, square"
+        assert any(note in text for text in evaluate(run, shards, PROTOCOL).notes)
+    leaking = SplitTable("mine", (), (Split((), ("bar", "disc")),))
+    with pytest.raises(UsageError, match="was trained with the labels of bar, disc, which split 0 of mine tests"):
+        evaluate(run, shards, PROTOCOL, table=leaking)

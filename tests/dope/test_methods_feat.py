@@ -155,9 +155,17 @@ def begun(config: TrainConfig) -> FeatNetwork:
     """The network of a run before its first step."""
     method = method_of(config)
     network = new_state(method, ALONE).network
-    method.start(network)
+    method.start(network, {})
     assert isinstance(network, FeatNetwork)
     return network
+
+
+def test_the_regulariser_of_one_shot_is_told_where_there_are_more(caplog: pytest.LogCaptureFixture) -> None:
+    begun(tiny())
+    begun(tiny("feat.shots=5", "feat.balance=0.1", "feat.centre_temperature=16"))
+    assert "feat.balance" not in caplog.text
+    begun(tiny("feat.shots=5"))
+    assert "for 5 it is 0.1, feat.centre_temperature 16" in caplog.text
 
 
 def test_it_starts_with_the_encoder_of_simpleshot_or_rfs(shards: Path, tmp_path: Path) -> None:

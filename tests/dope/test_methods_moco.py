@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 import torch
 import torch.nn.functional as F
-from tiny_drawn import draw_pairs
+from tiny_drawn import draw_pairs, with_manifest
 from tiny_method_runs import better_than_chance, same_after_a_stop, tiny_method
 from tiny_shards import write_shards
+from tiny_views import write_views
 from torch import Tensor, nn
 
 from dope.common.errors import UsageError
@@ -24,6 +25,7 @@ from dope.methods.vispe_moco import moco_loss
 from dope.networks.batchnorm import batchnorms
 from dope.order import Place
 from dope.state import new_state
+from dope.trainer import train
 
 ALONE = Ranks(0, 1, torch.device("cpu"))
 
@@ -150,6 +152,22 @@ def test_keys_come_back_in_order_from_their_shuffled_batches() -> None:
         assert torch.equal(keys, expected)
 
 
+@pytest.mark.parametrize("method", ["vispe_moco", "supmoco"])
+def test_a_step_tells_how_far_keys_differ(tmp_path: Path, method: str) -> None:
+    """A loss of log(1 + queue) may be that of a young network, or of one that maps everything to one vector."""
+    shards = write_shards(tmp_path, n_objects=8, size=32) if method == "vispe_moco" else write_views(tmp_path, size=32)
+    trained = method_of(tiny_method(method))
+    dataset = trained.dataset(shards if method == "vispe_moco" else with_manifest(shards), "train")
+    state = new_state(trained, ALONE, {"classes": ["a", "b"]})
+    (rows, *_) = trained.order(dataset).batches(Place(), 1)
+    batch, found = trained.prepare(dataset.batch(rows), 0), []
+    for weight in (None, 0.0):
+        if weight is not None:
+            state.momentum.network.head[-1].weight.fill_(weight)
+        found.append(trained.losses(trained.online(state.network), state.momentum, batch, ALONE).report["spread"])
+    assert 0.01 < found[0] <= 1 and found[1] == pytest.approx(0, abs=1e-6)
+
+
 def test_what_evaluation_sees_is_the_encoder_without_the_head() -> None:
     method = method_of(tiny_method("vispe_moco"))
     network = new_state(method, ALONE).network.eval()
@@ -177,6 +195,20 @@ def test_retrieval_counts_pairs_that_find_their_own_second_view() -> None:
 def test_local_negatives_are_refused() -> None:
     with pytest.raises(UsageError, match=r"distributed.local_negatives: cannot be used by vispe_moco"):
         method_of(tiny_method("vispe_moco", "distributed.local_negatives=true"))
+
+
+def test_settings_of_other_methods_are_refused(shards: Path, tmp_path: Path) -> None:
+    for method, setting, instead in (
+        ("vispe_moco", "loss.temperature=0.5", "Did you mean moco.temperature?"),
+        ("vispe_moco", "supmoco.queue=8", "Did you mean moco.queue?"),
+        ("vispe", "loss.negatives=second_view", "Leave out loss.negatives"),
+        ("vispe", "network.predict_mask=false", "Leave out network.predict_mask"),
+        ("dope", "moco.temperature=0.5", "Did you mean loss.temperature?"),
+    ):
+        with pytest.raises(UsageError, match=rf"^{setting.split('=')[0]}: is not read by {method}\. .*") as error:
+            train(shards, tmp_path / method, tiny_method(method, setting))
+        assert instead in str(error.value)
+        assert not (tmp_path / method / "config.yaml").exists()
 
 
 def test_settings_that_make_no_sense_are_refused() -> None:

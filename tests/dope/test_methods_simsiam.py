@@ -18,8 +18,9 @@ from dope.config import load_config
 from dope.distributed import Ranks
 from dope.methods import method_of
 from dope.methods.configs import SimSiamConfig
-from dope.methods.vispe_simsiam import SimSiamNetwork, negative_cosine, spread
-from dope.state import learning_rate, new_state, set_learning_rate
+from dope.methods.queue import spread
+from dope.methods.vispe_simsiam import SimSiamNetwork, negative_cosine
+from dope.state import highest_rate, learning_rate, new_state, set_learning_rate
 from dope.trainer import train
 
 ALONE = Ranks(0, 1, torch.device("cpu"))
@@ -145,6 +146,15 @@ def test_presets_are_the_papers() -> None:
     )
     assert colours.jitter == (0.4, 0.4, 0.4, 0.1) and colours.background_removal == "paired"
     assert (config.simsiam.projector, config.simsiam.predictor) == (2048, 512)
+
+
+def test_the_rate_goes_with_the_batch() -> None:
+    for batch, rate in ((256, 0.05), (512, 0.1), (64, 0.0125)):
+        config = load_config("paper", None, [f"data.batch_size={batch}"], method="vispe_simsiam")
+        assert highest_rate(config) == learning_rate(config, 0, 10) == pytest.approx(rate)
+    assert highest_rate(load_config("paper", None, ["data.batch_size=64"])) == 1e-4, "only where it is asked for"
+    with pytest.raises(UsageError, match=r"optimiser\.lr_batch: .*must not be negative"):
+        load_config("paper", None, ["optimiser.lr_batch=-1"])
 
 
 def test_a_run_that_was_stopped_ends_with_the_same_weights(shards: Path, tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ from dope.methods import load_embedder, method_of
 from dope.methods.pooled import PooledNetwork
 from dope.methods.simpleshot import SimpleShot, SimpleShotEmbedder, SimpleShotNetwork, mean_feature, nearest_mean
 from dope.methods.supervised import ClassifierNetwork, augmented, cross_entropy
+from dope.order import Place
 from dope.run_logging import read_metrics
 from dope.single_views import ViewDataset
 from dope.state import new_state
@@ -322,7 +323,7 @@ def test_a_class_that_only_the_held_out_views_have_does_no_harm(tmp_path: Path) 
 def test_what_cannot_be_learnt_from_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     nameless = write_labelled(tmp_path / "nameless", shapes=("bar", "disc"), objects=4, unnamed=True)
     lonely = write_labelled(tmp_path / "lonely", shapes=("bar",), objects=8)
-    for method in ("simpleshot", "rfs"):
+    for method in ("simpleshot", "rfs", "supmoco"):
         with pytest.raises(BadInput, match=r"views\.parquet: the views have no category"):
             train(nameless, tmp_path / "run", tiny(method=method))
         with pytest.raises(BadInput, match=r"views\.parquet: has views of one class only \('bar'\)"):
@@ -385,3 +386,16 @@ def test_it_recognises_classes_that_it_has_not_seen(
 def test_the_classifier_network_has_a_logit_a_class() -> None:
     network = ClassifierNetwork(0.125, 5)
     assert network(torch.rand(2, 3, 32, 32)).shape == (2, 5)
+
+
+def test_an_error_does_not_wait_for_the_mean(copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Other ranks end at once, and with them the first one: it would be ended before its checkpoint was written."""
+    config = tiny("validation.every=0")
+    method = method_of(config)
+    rows = list(method.order(method.dataset(copy, "train")).batches(Place(), 1))[1]
+    damage(copy, ViewDataset(copy, "train", image_size=32).batch(rows[:1]).keys[0])
+    monkeypatch.setattr("dope.methods.simpleshot.mean_feature", lambda *_, **__: pytest.fail("goes through all views"))
+    with pytest.raises(BadInput, match="max_bad_samples"):
+        train(copy, tmp_path / "run", config)
+    embedder, meta = load_embedder(tmp_path / "run")
+    assert meta["step"] == 1 and isinstance(embedder, SimpleShotEmbedder) and bool(embedder.mean.isnan().all())

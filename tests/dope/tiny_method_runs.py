@@ -11,6 +11,8 @@ from tiny_runs import TINY, losses_of
 
 from dope.checkpoints import read_checkpoint
 from dope.config import TrainConfig, load_config
+from dope.methods import method_class
+from dope.methods.base import OF_SOME_METHODS
 from dope.trainer import train
 
 SMALL = [
@@ -27,7 +29,13 @@ LEARNING = [
 
 
 def tiny_method(method: str, *overrides: str) -> TrainConfig:
-    return load_config("nano", None, [*TINY, *SMALL, *overrides], method=method)
+    return load_config("nano", None, [*TINY, *_read_by(method, SMALL), *overrides], method=method)
+
+
+def _read_by(method: str, overrides: list[str]) -> list[str]:
+    """Those that are not of other methods."""
+    others = set(OF_SOME_METHODS) - set(method_class(method).sections)
+    return [setting for setting in overrides if setting.split(".")[0] not in others]
 
 
 def same_after_a_stop(shards: Path, folder: Path, config: TrainConfig) -> None:
@@ -46,7 +54,7 @@ def same_after_a_stop(shards: Path, folder: Path, config: TrainConfig) -> None:
 
 def better_than_chance(shards: Path, out: Path, method: str, *overrides: str) -> None:
     """The lower end of the 95% confidence interval (Wilson) is above chance and above the untrained network's score."""
-    result = train(shards, out, load_config("nano", None, [*LEARNING, *overrides], method=method))
+    result = train(shards, out, load_config("nano", None, [*_read_by(method, LEARNING), *overrides], method=method))
     last = read_checkpoint(out)["validation"]
     assert result["score"] == last[result["score_name"]]
     n, share, z = last["pairs"], result["score"], 1.96
