@@ -79,6 +79,14 @@ def evaluate(
             "features: centroid (nearest class mean), nearest (nearest shot), logistic (regression in each episode)."
         ),
     ] = "auto",
+    points: Annotated[
+        int,
+        typer.Option(help="With local: cells of the query's foreground that look for a match (the paper's k)."),
+    ] = 20,
+    foreground: Annotated[
+        float,
+        typer.Option(help="With local: a query's cells whose soft mask is at least this are its foreground."),
+    ] = 0.9,
     support_copies: Annotated[
         int,
         typer.Option(
@@ -171,7 +179,7 @@ def evaluate(
     values: dict[str, Any] = {
         "classifier": classifier, "split": split, "compare_untrained": compare_untrained, "part": part,
         "support_copies": support_copies, "memory_gib": memory if memory_gb is None else memory_gb,
-        "categories": tuple(categories or ()),
+        "categories": tuple(categories or ()), "matching": {"points": points, "foreground": foreground},
         "table_splits": tuple(table_split or ()), "protocols": protocols,
     }  # fmt: skip
     config = settings.from_mapping(EvaluationConfig, values, where="dope eval")

@@ -304,6 +304,10 @@ def _check(config: EvaluationConfig, table: SplitTable | None) -> None:
     if not config.protocols:
         raise UsageError("no protocol to evaluate", where="--ways, --shots")
     settings.require_at_least(config, support_copies=1, batch=1, memory_gib=0)
+    if config.matching.points < 1:
+        raise UsageError(f"must be 1 or more, not {config.matching.points}", where="--points")
+    if not 0 <= config.matching.foreground <= 1:
+        raise UsageError(f"must be from 0 to 1, not {config.matching.foreground}", where="--foreground")
     if table is None and config.table_splits:
         raise UsageError("is for --table or --split-file", where="--table-split")
     if table is None and config.part != "test":

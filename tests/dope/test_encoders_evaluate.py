@@ -83,6 +83,17 @@ def test_an_encoders_rows_say_which_and_stand_in_one_table(module: str, shards: 
     assert f"{module}:dense + given masks" in said and "mean colour" in said and "1-NN" in said
 
 
+def test_local_matching_is_the_papers_unless_asked_otherwise(module: str, shards: Path) -> None:
+    asked: dict[str, tuple[object, ...]] = {
+        "usual": (), "paper": ("--points", 20, "--foreground", 0.9),
+        "fewer": ("--points", 3), "more": ("--foreground", 0.5),
+    }  # fmt: skip
+    for name, options in asked.items():
+        command("eval", shards, "--encoder", f"{module}:dense", *FEW, *options, "--out", name)
+    hashes = [read_rows(Path(name) / "results.parquet")[0].evaluation_hash for name in asked]
+    assert hashes[0] == hashes[1] and len(set(hashes)) == 3  # tables refuse the others beside it
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -94,6 +105,8 @@ def test_an_encoders_rows_say_which_and_stand_in_one_table(module: str, shards: 
         (("SHARDS", "--encoder", "m:f", "--compare-untrained"), "--compare-untrained: is for runs"),
         (("SHARDS", "--encoder", "no_such_module:f"), "no module 'no_such_module'"),
         (("SHARDS", "--encoder", "MODULE:pooled", "--classifier", "local"), "has no dense features"),
+        (("SHARDS", "--encoder", "MODULE:dense", "--points", "0"), "--points: must be 1 or more"),
+        (("SHARDS", "--encoder", "MODULE:dense", "--foreground", "1.5"), "--foreground: must be from 0 to 1"),
     ],
 )
 def test_wrong_combinations_are_explained(module: str, shards: Path, arguments: tuple[str, ...], message: str) -> None:
