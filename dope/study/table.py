@@ -43,8 +43,9 @@ def study_table(pieces: Sequence[Piece], out: Path, also: str | None = None) -> 
         lines.append([variant.label, ", ".join(classifiers), *cells])
     lines.append(["chance", "", *(f"{100 / ways:.1f}" for ways, _ in columns)])
     row = rows[0].row
+    queries = " or ".join(map(str, sorted({item.row.queries for item in rows}, reverse=True)))  # --fit may take fewer
     said = (
-        f"Accuracy in % ± half its 95% confidence interval over {row.episodes:,} episodes of {row.queries} queries a "
+        f"Accuracy in % ± half its 95% confidence interval over {row.episodes:,} episodes of {queries} queries a "
         f"class, {row.n_classes} classes, {row.n_objects} objects, {row.n_views:,} views"
     )
     if seeds > 1:

@@ -106,6 +106,13 @@ def test_more_views_are_tested_beside_and_shown_apart(tmp_path: Path, monkeypatc
     assert (piece.run / "eval" / "results.parquet").exists()
 
 
+def test_the_caption_has_all_numbers_of_queries(tmp_path: Path) -> None:
+    pieces = pieces_of(ABLATIONS[:1], replace(CONFIG, seeds=(0,)), tmp_path)
+    rows = [row(shots=shots, queries=q, asked_queries=15, run=pieces[0].name) for shots, q in ((1, 9), (5, 5))]
+    append_rows(pieces[0].run / "eval" / "results.parquet", rows)
+    assert "of 9 or 5 queries a class" in study_table(pieces, tmp_path)
+
+
 def test_rows_of_validation_classes_are_not_in_the_table(tmp_path: Path) -> None:
     pieces = pieces_of(ABLATIONS[:1], replace(CONFIG, seeds=(0,)), tmp_path)
     rows = [row(run=pieces[0].name, part=part, accuracy=a) for part, a in (("val", 0.9), ("test", 0.4))]
