@@ -1,4 +1,4 @@
-"""SimpleShot and RFS: cross entropy on base classes, the mean feature, and how episodes are classified."""
+"""SimpleShot and RFS: cross entropy on base classes, and the mean feature."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from episodes_of_rows import episodes_of
 from numpy.typing import NDArray
 from tiny_labelled import UNSEEN, damage, rewrite, write_labelled
 
@@ -22,11 +23,11 @@ from dope.checkpoints import find_checkpoint, load_method, load_network
 from dope.common.errors import BadInput, UsageError
 from dope.config import TrainConfig, load_config
 from dope.distributed import Ranks
-from dope.lowshot.episodes import EpisodeConfig, Episodes
+from dope.lowshot.episodes import EpisodeConfig
 from dope.lowshot.evaluate import EvaluationConfig, evaluate
 from dope.methods import load_embedder, method_of
 from dope.methods.pooled import PooledNetwork
-from dope.methods.simpleshot import SimpleShot, SimpleShotEmbedder, SimpleShotNetwork, mean_feature, nearest_mean
+from dope.methods.simpleshot import SimpleShot, SimpleShotEmbedder, SimpleShotNetwork, mean_feature
 from dope.methods.supervised import ClassifierNetwork, augmented, cross_entropy
 from dope.order import Place
 from dope.run_logging import read_metrics
@@ -218,39 +219,6 @@ def test_damaged_views_are_left_out_of_the_mean_and_said_to_be(copy: Path, caplo
     assert "leaves out 3 damaged views of 32" in caplog.text
     wanted = naive_mean(network.eval(), dataset, [row for row in range(32) if row not in (3, 8, 9)])
     assert np.abs(found.numpy() - wanted).max() < 1e-6 * np.abs(wanted).max()
-
-
-def episodes_of(support: Any, query: Any) -> Episodes:
-    support, query = np.array(support), np.array(query)
-    config = EpisodeConfig(support.shape[1], support.shape[2], query.shape[2], len(support))
-    return Episodes(support, query, np.zeros(support.shape[:2], np.int64), (), config)
-
-
-@pytest.mark.parametrize("transform", ["cl2n", "l2n", "un"])
-def test_the_nearest_mean_is_the_naive_one(transform: str) -> None:
-    random = np.random.default_rng(5)
-    vectors, mean = random.gamma(1, 1, (60, 6)).astype(np.float32), np.full(6, 0.9, np.float32)
-    rows = np.stack([random.permutation(60)[:30] for _ in range(40)]).reshape(40, 3, 10)
-    drawn = episodes_of(rows[:, :, :3], rows[:, :, 3:])
-
-    def changed(index: int) -> NDArray[np.float64]:
-        x = vectors[index].astype(np.float64) - (mean if transform == "cl2n" else 0)
-        return x if transform == "un" else x / math.sqrt(sum(x * x))
-
-    found = nearest_mean(vectors, drawn, transform, mean)
-    for e, way, i in np.ndindex(*drawn.query.shape):
-        means = [sum(changed(s) for s in shots) / 3 for shots in drawn.support[e]]
-        query = changed(drawn.query[e, way, i])
-        assert found[e, way, i] == int(np.argmin([sum((query - m) ** 2) for m in means]))
-
-
-def test_class_means_are_not_scaled_to_unit_length_again() -> None:
-    # the first class's shots point in opposite ways but for a little: its mean is short, and far from every unit vector
-    at = np.deg2rad([80, -80, 60, 60, 25])
-    vectors = np.stack([np.cos(at), np.sin(at)], 1).astype(np.float32)
-    drawn = episodes_of([[[0, 1], [2, 3]]], [[[4], [4]]])
-    # to the mean (0.17, 0) it is 0.85, to (0.5, 0.87) 0.60; by angle it is nearer to the first
-    assert nearest_mean(vectors, drawn, "l2n", np.zeros(2)).ravel().tolist() == [1, 1]
 
 
 def test_rfs_is_the_same_training_without_a_mean(shards: Path, tmp_path: Path) -> None:
